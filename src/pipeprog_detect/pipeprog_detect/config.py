@@ -1,0 +1,26 @@
+"""Settings of the detector, one dataclass per stage; DetectConfig holds them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class ContourConfig:
+    """Refinement by the outlines in the keyframes."""
+
+    enabled: bool = field(
+        default=True, metadata={"description": "refine radius, axis and ends by the outlines in the keyframes", "unit": ""}
+    )
+
+
+@dataclass(frozen=True)
+class DetectConfig:
+    """All settings of the detector."""
+
+    seed: int = field(default=0, metadata={"description": "seed of every random choice", "unit": "", "range": (0, 2**31 - 1)})
+    front_end: str = field(
+        default="normals",
+        metadata={"description": "how cylinders are found in the cloud", "unit": "", "choices": ("normals", "planes")},
+    )
+    contour: ContourConfig = field(default_factory=ContourConfig)

@@ -1,0 +1,62 @@
+"""What the detector takes and returns: clouds, views, cylinders, pipes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pipeprog_frames.camera import Camera
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A metric point cloud: points (N, 3) float64 [m]; normals (N, 3) float64 unit, towards the sensor, or None."""
+
+    points: FloatArray
+    normals: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class View:
+    """One keyframe: grey image (H, W) uint8 of the ideal pinhole camera (already undistorted), and its pose."""
+
+    stamp: int
+    image: NDArray[np.uint8]
+    camera: Camera
+    camera_from_map: FloatArray
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A finite circular cylinder: ends of its axis (3,) [m] and its radius [m]."""
+
+    start: FloatArray
+    end: FloatArray
+    radius: float
+
+    @property
+    def length(self) -> float:
+        """Distance between the ends [m]."""
+        return float(np.linalg.norm(self.end - self.start))
+
+    @property
+    def axis(self) -> FloatArray:
+        """Unit vector (3,) from start to end."""
+        return (self.end - self.start) / self.length
+
+
+@dataclass(frozen=True)
+class Pipe:
+    """A measured and classified pipe; fields as in pipeprog_msgs/Pipe (metres, radians)."""
+
+    id: str
+    cylinder: Cylinder
+    radius_sigma: float
+    class_name: str | None
+    class_probability: float
+    visible_arc: float
+    rmse: float
+    points: int
