@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeprog_frames.errors import InputError
 
-# Number of coefficients that each ROS distortion model may carry (REP-104 era names and their aliases).
+# Number of coefficients that each ROS distortion model may carry.
 DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
     "plumb_bob": (0, 4, 5),
     "rational_polynomial": (8, 12, 14),
@@ -43,7 +43,8 @@ class Camera:
             raise InputError(f"camera size {self.width} x {self.height} is no image size: set width and height")
         if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
             raise InputError(
-                f"camera is not calibrated (fx = {self.fx:g}, fy = {self.fy:g}): calibrate it and fill K of its CameraInfo"
+                f"camera is not calibrated (fx = {self.fx:g}, fy = {self.fy:g}): "
+                "calibrate it and fill K of its CameraInfo"
             )
         model = _ALIASES.get(self.distortion_model, self.distortion_model)
         if model not in DISTORTION_MODELS:
@@ -52,7 +53,9 @@ class Camera:
             )
         coefficients = tuple(float(value) for value in self.distortion)
         if len(coefficients) not in DISTORTION_MODELS[model] and any(coefficients):
-            raise InputError(f"distortion model {model} takes {DISTORTION_MODELS[model]} coefficients, not {len(coefficients)}")
+            raise InputError(
+                f"distortion model {model} takes {DISTORTION_MODELS[model]} coefficients, not {len(coefficients)}"
+            )
         if not np.isfinite(coefficients).all():
             raise InputError(f"distortion coefficients {coefficients} are not finite: calibrate the camera again")
         object.__setattr__(self, "distortion_model", model)
@@ -60,12 +63,24 @@ class Camera:
 
     @classmethod
     def from_calibration(
-        cls, width: int, height: int, k: ArrayLike, distortion_model: str = "plumb_bob", distortion: Sequence[float] = ()
+        cls,
+        width: int,
+        height: int,
+        k: ArrayLike,
+        distortion_model: str = "plumb_bob",
+        distortion: Sequence[float] = (),
     ) -> Camera:
         """Camera from the row-major (3, 3) or (9,) matrix K; raises InputError where it is not calibrated."""
         matrix = np.asarray(k, float).reshape(3, 3)
         return cls(
-            int(width), int(height), matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], distortion_model, tuple(distortion)
+            int(width),
+            int(height),
+            matrix[0, 0],
+            matrix[1, 1],
+            matrix[0, 2],
+            matrix[1, 2],
+            distortion_model,
+            tuple(distortion),
         )
 
     @property
@@ -99,7 +114,9 @@ class Camera:
         if self.distortion_model == "equidistant":
             return cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), self.matrix, coefficients).reshape(-1, 2)
         zero = np.zeros(3)
-        return cv2.projectPoints(np.c_[rays, np.ones(len(rays))], zero, zero, self.matrix, coefficients)[0].reshape(-1, 2)
+        return cv2.projectPoints(np.c_[rays, np.ones(len(rays))], zero, zero, self.matrix, coefficients)[0].reshape(
+            -1, 2
+        )
 
     def undistort_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image as the ideal pinhole camera with the same K and size sees it."""

@@ -17,3 +17,34 @@ class FramesConfig:
             "range": (0.3, 0.99),
         },
     )
+    parallax_max: float = field(
+        default=0.04,
+        metadata={
+            "description": "a keyframe is due when the median parallax exceeds this share of the image width",
+            "unit": "",
+            "range": (0.005, 0.5),
+        },
+    )
+    window: int = field(
+        default=5,
+        metadata={
+            "description": "the sharpest of this many frames is taken; below the frames that replay keeps in flight",
+            "unit": "frames",
+            "range": (1, 6),
+        },
+    )
+    buffer_mib: int = field(
+        default=256,
+        metadata={
+            "description": "memory for compressed frames that the feedback of the SfM may still call for",
+            "unit": "MiB",
+            "range": (8, 4096),
+        },
+    )
+    lockstep: bool = field(
+        default=False,
+        metadata={
+            "description": "wait for the SfM after each keyframe, so that a recording gives the same result every time",
+            "unit": "",
+        },
+    )
