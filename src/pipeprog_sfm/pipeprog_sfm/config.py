@@ -23,6 +23,22 @@ class BoardConfig:
         default=True,
         metadata={"description": "correct circle centres for the eccentricity of their images", "unit": ""},
     )
+    min_radius: float = field(
+        default=4.0,
+        metadata={"description": "smallest image of a circle that is looked for", "unit": "px", "range": (3.0, 100.0)},
+    )
+    tolerance: float = field(
+        default=0.0001,
+        metadata={
+            "description": "standard deviation of a circle's place on the real board against its file",
+            "unit": "m",
+            "range": (0.0, 0.01),
+        },
+    )
+    upright: bool = field(
+        default=True,
+        metadata={"description": "the first board hangs plumb: its y axis becomes the map's z axis", "unit": ""},
+    )
 
 
 @dataclass(frozen=True)
@@ -30,8 +46,12 @@ class StereoConfig:
     """Depth maps."""
 
     max_pairs: int = field(
-        default=2,
+        default=3,
         metadata={"description": "neighbours that each keyframe is matched with", "unit": "", "range": (1, 8)},
+    )
+    width: int = field(
+        default=1280,
+        metadata={"description": "width at which images are matched, at most their own", "unit": "px", "range": (160, 4096)},
     )
 
 
@@ -43,6 +63,18 @@ class FusionConfig:
         default=0.004,
         metadata={"description": "edge of a voxel, at most one point each", "unit": "m", "range": (0.0005, 0.1)},
     )
+    min_views: int = field(
+        default=3,
+        metadata={"description": "depth maps that must agree on a point", "unit": "", "range": (1, 20)},
+    )
+    max_neighbours: int = field(
+        default=8,
+        metadata={"description": "depth maps that each new one is compared with", "unit": "", "range": (1, 64)},
+    )
+    max_maps: int = field(
+        default=400,
+        metadata={"description": "latest depth maps kept in memory for comparison", "unit": "", "range": (2, 100000)},
+    )
 
 
 @dataclass(frozen=True)
@@ -50,6 +82,10 @@ class SfmConfig:
     """All settings of the reconstruction."""
 
     seed: int = field(default=0, metadata={"description": "seed of every random choice", "unit": "", "range": (0, 2**31 - 1)})
+    map_interval: int = field(
+        default=5,
+        metadata={"description": "keyframes between two publications of the map", "unit": "", "range": (1, 1000)},
+    )
     mapper: MapperConfig = field(default_factory=MapperConfig)
     board: BoardConfig = field(default_factory=BoardConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
