@@ -1,0 +1,233 @@
+"""Recordings: the images of one camera with its calibration, from an .mcap file or a rosbag2 folder."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from pipeprog_bringup import cdr
+from pipeprog_bringup.mcap_file import McapFile, Message
+from pipeprog_frames.camera import Camera
+from pipeprog_frames.errors import InputError
+
+_IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
+# Depth and disparity images travel as the same message types; no camera's picture has these encodings.
+_DEPTH_ENCODINGS = ("16UC1", "32FC1", "32FC2")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a recording: header stamp [ns], frame, serialised message, and the calibration in force."""
+
+    stamp: int
+    frame_id: str
+    data: bytes
+    camera_info: bytes
+
+
+@dataclass(frozen=True)
+class Bag:
+    """One camera of a recording; iterate it for its frames in the order in which they were recorded."""
+
+    path: Path
+    image_topic: str
+    image_type: str
+    camera_info_topic: str
+    image_count: int
+    camera: Camera
+    _files: tuple[McapFile, ...]
+    _first_info: bytes
+
+    @classmethod
+    def open(cls, path: Path, image_topic: str | None = None, camera_info_topic: str | None = None) -> Bag:
+        """Find the camera of the recording `path` and check that its images and its calibration fit.
+
+        Topics that are not given are found by their types. Raises InputError where the recording cannot be read, holds
+        no calibrated camera or several, or where image and CameraInfo differ in size.
+        """
+        files = tuple(McapFile.open(part) for part in _parts(path))
+        counts, types = _topics(files, path)
+        image_topic, info_topic = _choose(path, files, counts, types, image_topic, camera_info_topic)
+        infos = (message.data for message in _messages(files, {info_topic}))
+        first_info, camera = _first_camera(path, info_topic, infos)
+        bag = cls(path, image_topic, types[image_topic], info_topic, counts[image_topic], camera, files, first_info)
+        bag._check_size()
+        return bag
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Stream the images; each carries the CameraInfo last recorded for its frame (the first one, before any)."""
+        latest: dict[str, bytes] = {}
+        newest = self._first_info
+        for topic, message in _tagged(self._files, {self.image_topic, self.camera_info_topic}):
+            try:
+                stamp, frame_id = cdr.read_header(message.data)
+                if topic == self.camera_info_topic:
+                    cdr.read_camera_info(message.data)
+            except ValueError:
+                if topic == self.image_topic:
+                    yield Frame(message.log_time, "", message.data, newest)
+                continue
+            if topic == self.camera_info_topic:
+                newest = latest[frame_id] = message.data
+            else:
+                yield Frame(stamp, frame_id, message.data, latest.get(frame_id, newest))
+
+    @property
+    def losses(self) -> list[str]:
+        """What the recording has lost, one sentence each; complete once it was read to its end."""
+        return [note for file in self._files for note in file.losses()]
+
+    def _check_size(self) -> None:
+        """Compare the first image that can be decoded with the CameraInfo."""
+        for frame in self:
+            size = cdr.image_size(frame.data, self.image_type)
+            if size is None:
+                continue
+            if size != (self.camera.width, self.camera.height):
+                raise InputError(
+                    f"{self.path}: images on {self.image_topic} are {size[0]} x {size[1]}, but "
+                    f"{self.camera_info_topic} is calibrated for {self.camera.width} x {self.camera.height}: "
+                    "record the CameraInfo of this camera mode"
+                )
+            return
+        raise InputError(f"{self.path}: none of the {self.image_count} images on {self.image_topic} can be decoded")
+
+
+def _parts(path: Path) -> list[Path]:
+    """The mcap files of a recording, in order."""
+    if not path.exists():
+        raise InputError(f"no such bag: {path}")
+    if not path.is_dir():
+        return [path]
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        inside = sorted(file.name for file in path.glob("*.mcap"))
+        remedy = f"give one of its files ({', '.join(inside)}) or run" if inside else "give a rosbag2 folder, or run"
+        raise InputError(f"{path} has no metadata.yaml: {remedy} `ros2 bag reindex {path}`")
+    try:
+        information = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+        names = [str(name) for name in information["relative_file_paths"]]
+        storage = information.get("storage_identifier", "mcap")
+        mode = str(information.get("compression_mode", "")).upper()
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+        raise InputError(f"{metadata} is no rosbag2 metadata ({error}): run `ros2 bag reindex {path}`") from None
+    if storage != "mcap":
+        raise InputError(f"{path} is stored as {storage}: convert it with `ros2 bag convert` (storage_id: mcap)")
+    if mode == "FILE":
+        raise InputError(f"{path} is compressed file by file: decompress it with `ros2 bag convert`")
+    if not names:
+        raise InputError(f"{metadata} names no file: the recording is empty")
+    # Before Foxy the names were relative to the folder above.
+    parts = [path / name if (path / name).exists() else path / Path(name).name for name in names]
+    missing = [part.name for part in parts if not part.is_file()]
+    if missing:
+        raise InputError(f"{path}: {', '.join(missing)} named in metadata.yaml is missing: copy the folder again")
+    return parts
+
+
+def _topics(files: tuple[McapFile, ...], path: Path) -> tuple[Counter[str], dict[str, str]]:
+    """Messages per topic, type per topic; raises InputError where there is nothing in the recording."""
+    counts: Counter[str] = Counter()
+    types: dict[str, str] = {}
+    for file in files:
+        for channel_id, channel in file.channels.items():
+            if not file.counts[channel_id]:
+                continue
+            if channel.encoding == "ros1":
+                raise InputError(f"{file.path} is a ROS 1 recording: convert it to ROS 2 (message encoding cdr)")
+            counts[channel.topic] += file.counts[channel_id]
+            types[channel.topic] = channel.type_name
+    if not counts:
+        notes = "; ".join(note for file in files for note in file.losses())
+        raise InputError(f"{path} holds no messages" + (f" ({notes})" if notes else ": record it again"))
+    return counts, types
+
+
+def _choose(
+    path: Path,
+    files: tuple[McapFile, ...],
+    counts: Counter[str],
+    types: dict[str, str],
+    image_topic: str | None,
+    info_topic: str | None,
+) -> tuple[str, str]:
+    """The topics of the one camera; raises InputError that lists the cameras where there are several or none."""
+    infos = sorted(topic for topic, name in types.items() if name == cdr.CAMERA_INFO)
+    images = sorted(topic for topic, name in types.items() if name in _IMAGE_TYPES)
+    for flag, topic, known in (("--image-topic", image_topic, images), ("--camera-info-topic", info_topic, infos)):
+        if topic is not None and topic not in known:
+            raise InputError(
+                f"{path}: {flag} {topic} is not among its topics: {', '.join(known) or 'none of that type'}"
+            )
+    cameras = [topic for topic in images if not _is_depth(files, topic, types[topic])]
+    if image_topic is None:
+        # The same picture is often recorded raw and compressed; the compressed one is what the graph passes on anyway.
+        cameras = [
+            topic for topic in cameras if types[topic] == cdr.COMPRESSED_IMAGE or f"{topic}/compressed" not in cameras
+        ]
+        if info_topic is not None:
+            beside = [topic for topic in cameras if _sibling_info(topic) == info_topic]
+            cameras = beside or cameras
+    else:
+        cameras = [image_topic]
+    if not cameras:
+        kinds = ", ".join(f"{topic} ({name})" for topic, name in sorted(types.items()))
+        raise InputError(f"{path} holds no images (sensor_msgs Image or CompressedImage): its topics are {kinds}")
+    if not infos:
+        raise InputError(
+            f"{path} holds images on {', '.join(cameras)} but no sensor_msgs/CameraInfo: record that topic too"
+        )
+    if len(cameras) == 1:
+        if info_topic is not None:
+            return cameras[0], info_topic
+        if len(infos) == 1:
+            return cameras[0], infos[0]
+        if _sibling_info(cameras[0]) in infos:
+            return cameras[0], _sibling_info(cameras[0])
+    choices = [
+        f"  --image-topic {camera} --camera-info-topic {info}   # {counts[camera]} images"
+        for camera in cameras
+        for info in ([_sibling_info(camera)] if _sibling_info(camera) in infos else infos)
+    ]
+    raise InputError(f"{path} holds several cameras: choose one with\n" + "\n".join(choices))
+
+
+def _sibling_info(image_topic: str) -> str:
+    """The camera_info topic that belongs to an image topic by image_transport's convention."""
+    base = image_topic.removesuffix("/compressed")
+    return f"{base.rpartition('/')[0]}/camera_info"
+
+
+def _is_depth(files: tuple[McapFile, ...], topic: str, type_name: str) -> bool:
+    first = next(_messages(files, {topic}), None)
+    encoding = cdr.image_encoding(first.data, type_name) if first else ""
+    return encoding.startswith(_DEPTH_ENCODINGS) or "compressedDepth" in encoding
+
+
+def _first_camera(path: Path, topic: str, infos: Iterator[bytes]) -> tuple[bytes, Camera]:
+    """The first CameraInfo that can be read, and its camera."""
+    for data in infos:
+        try:
+            info = cdr.read_camera_info(data)
+        except ValueError:
+            continue
+        try:
+            return data, info.camera()
+        except InputError as error:
+            raise InputError(f"{path}: {topic}: {error}") from None
+    raise InputError(f"{path}: no message on {topic} can be read: record it again")
+
+
+def _messages(files: tuple[McapFile, ...], topics: set[str]) -> Iterator[Message]:
+    return (message for _, message in _tagged(files, topics))
+
+
+def _tagged(files: tuple[McapFile, ...], topics: set[str]) -> Iterator[tuple[str, Message]]:
+    for file in files:
+        names = {number: channel.topic for number, channel in file.channels.items() if channel.topic in topics}
+        for message in file.messages(set(names)):
+            yield names[message.channel_id], message

@@ -1,0 +1,80 @@
+"""Small recordings made for the tests."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from pipeprog_bringup import cdr
+from pipeprog_frames.camera import Camera
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+START = 1_700_000_000_000_000_000
+STEP = 200_000_000
+
+
+def jpeg(number: int, width: int = 64, height: int = 48) -> bytes:
+    """A small JPEG that differs from number to number and does not compress away."""
+    pixels = np.random.default_rng(number).integers(0, 255, (height, width), dtype=np.uint8)
+    return cv2.imencode(".jpg", pixels)[1].tobytes()
+
+
+def image(number: int, frame_id: str = "camera", encoded: bytes | None = None) -> bytes:
+    """CDR bytes of the compressed image `number`."""
+    return cdr.write_compressed_image(START + number * STEP, frame_id, "jpeg", encoded or jpeg(number))
+
+
+def info(number: int, camera: Camera = CAMERA, frame_id: str = "camera") -> bytes:
+    """CDR bytes of its CameraInfo."""
+    return cdr.write_camera_info(START + number * STEP, frame_id, camera)
+
+
+def raw_image(number: int, encoding: str = "mono8") -> bytes:
+    """CDR bytes of a raw sensor_msgs/Image."""
+    writer = cdr._Writer()
+    writer.header(START + number * STEP, "camera")
+    writer.numbers("I", 48, 64)
+    writer.string(encoding)
+    writer.numbers("B", 0)
+    writer.numbers("I", 64, 64 * 48)
+    return bytes(writer.data) + bytes(64 * 48)
+
+
+def mcap_bytes(
+    messages: list[tuple[str, str, int, bytes]],
+    compression: CompressionType = CompressionType.ZSTD,
+    chunk_size: int = 4000,
+    **options: bool,
+) -> bytes:
+    """An mcap file of (topic, type, log time, data) messages."""
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=compression, chunk_size=chunk_size, **options)
+    writer.start(profile="ros2", library="test")
+    channels: dict[str, int] = {}
+    for topic, type_name, log_time, data in messages:
+        if topic not in channels:
+            schema = writer.register_schema(type_name, "ros2msg", b"")
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(channels[topic], log_time, data, log_time)
+    writer.finish()
+    return stream.getvalue()
+
+
+def camera_messages(count: int, prefix: str = "/camera") -> list[tuple[str, str, int, bytes]]:
+    """Images and CameraInfo of one camera."""
+    messages = []
+    for number in range(count):
+        log_time = START + number * STEP
+        messages.append((f"{prefix}/camera_info", cdr.CAMERA_INFO, log_time, info(number)))
+        messages.append((f"{prefix}/image/compressed", cdr.COMPRESSED_IMAGE, log_time, image(number)))
+    return messages
+
+
+def write_bag(path: Path, messages: list[tuple[str, str, int, bytes]] | None = None) -> Path:
+    """A recording of eight frames, or of the messages given."""
+    path.write_bytes(mcap_bytes(camera_messages(8) if messages is None else messages))
+    return path
