@@ -1,0 +1,436 @@
+"""Target boards: their files, and which ellipses of an image are which circles of which board."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from pipeprog_frames.camera import Camera
+from pipeprog_frames.errors import InputError
+from pipeprog_sfm.conic import FloatArray, circle_centre_images, circles_from_conics, project_circles
+from pipeprog_sfm.ellipse import PROFILES, TargetEllipses
+
+LEAST_CIRCLES = 3  # circles that identify a board: fewer agree by chance
+MAX_CANDIDATES = 400  # ellipses considered in one image: a perforated sheet must not stall the search
+SAME_PLACE = 0.1  # of a circle's radius: circles of two layouts closer than that are the same circle
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat dark board with bright circles.
+
+    Attributes:
+        name: unique name.
+        circle_radius: radius of every circle, m.
+        centres: (N, 3) float64 circle centres in the board's frame, m: z = 0, x right and y up seen from the front.
+    """
+
+    name: str
+    circle_radius: float
+    centres: FloatArray
+
+    @property
+    def spread(self) -> float:
+        """Root of the summed squared distances of the circles from their mean, m: the lever that a scale rests on."""
+        return float(np.linalg.norm(self.centres - self.centres.mean(0)))
+
+
+@dataclass(frozen=True)
+class BoardObservation:
+    """Circles of one board in one image; pixels of the ideal pinhole camera.
+
+    Attributes:
+        board: name of the board (of the first one where several in the file have the same layout).
+        indices: (K,) int, rows of Board.centres.
+        centres: (K, 2) images of the circles' centres, px: the ellipses' centres freed from eccentricity.
+        ellipse_centres: (K, 2) centres of the ellipses, px.
+        conics: (K, 3, 3) the ellipses as conics.
+        sigma: standard deviation of one coordinate of a centre, px, from the scatter of the edge points.
+        camera_from_board: (4, 4) pose seen from this image alone, m.
+    """
+
+    board: str
+    indices: NDArray[np.intp]
+    centres: FloatArray
+    ellipse_centres: FloatArray
+    conics: FloatArray
+    sigma: float
+    camera_from_board: FloatArray
+
+
+def load_boards(path: str | Path) -> list[Board]:
+    """Boards of a BOARD.yaml file: `boards: [{name, circle_radius_mm, centres_mm: [[x, y], ...]}]`.
+
+    Raises:
+        InputError: the file cannot be read, a key is missing or unknown, text stands where a number belongs, a board
+            has fewer than three circles, circles that overlap or lie on one line, a layout that looks the same
+            turned by 120 degrees or less, or a name that is taken.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the board file cannot be read ({error})") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    entries = _entry(content, ("boards",), str(path))["boards"]
+    if not isinstance(entries, list) or not entries:
+        raise InputError(f"{path}: 'boards' must be a list with at least one board")
+    boards: list[Board] = []
+    for number, entry in enumerate(entries, 1):
+        board = _board(entry, f"{path}: board {number}")
+        if board.name in [other.name for other in boards]:
+            raise InputError(f"{path}: the name '{board.name}' is given to two boards: names must be unique")
+        boards.append(board)
+    return boards
+
+
+def _entry(value: Any, keys: Sequence[str], where: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: expected the keys {', '.join(keys)}, found {value!r}")
+    for key in value:
+        if key not in keys:
+            near = difflib.get_close_matches(str(key), keys, 1, 0.0)[0]
+            raise InputError(f"{where}: unknown key '{key}', did you mean '{near}'?")
+    for key in keys:
+        if key not in value:
+            raise InputError(f"{where}: the key '{key}' is missing")
+    return value
+
+
+def _board(value: Any, where: str) -> Board:
+    entry = _entry(value, ("name", "circle_radius_mm", "centres_mm"), where)
+    name = str(entry["name"])
+    where = f"{where} ('{name}')"
+    radius = _number(entry["circle_radius_mm"], f"{where}: circle_radius_mm")
+    if radius < 1.0:
+        raise InputError(f"{where}: circle_radius_mm = {radius:g} is too small: give millimetres, 1 or more")
+    rows = entry["centres_mm"]
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 2 for row in rows):
+        raise InputError(f"{where}: centres_mm must be a list of [x, y] pairs in millimetres")
+    if len(rows) < LEAST_CIRCLES:
+        raise InputError(f"{where}: {len(rows)} circles, but a board needs {LEAST_CIRCLES} or more")
+    flat = np.array([[_number(number, f"{where}: centres_mm") for number in row] for row in rows])
+    apart = np.linalg.norm(flat[:, None] - flat[None], axis=-1) + np.diag(np.full(len(flat), np.inf))
+    if apart.min() <= 2 * radius:
+        first, second = np.unravel_index(apart.argmin(), apart.shape)
+        raise InputError(f"{where}: circles {first + 1} and {second + 1} overlap ({apart.min():g} mm apart)")
+    if np.linalg.svd(flat - flat.mean(0), compute_uv=False)[1] < 2 * radius:
+        raise InputError(f"{where}: the circles lie on one line: move one aside, so that the board has a plane")
+    board = Board(name, radius / 1000, np.c_[flat, np.zeros(len(flat))] / 1000)
+    turns = len(symmetries(board))
+    if turns > 2:
+        raise InputError(
+            f"{where}: the layout looks the same {turns} ways round, so its circles cannot be told apart: move one circle"
+        )
+    return board
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise InputError(f"{where}: {value!r} is not a number")
+    return float(value)
+
+
+def symmetries(board: Board) -> NDArray[np.intp]:
+    """(S, N) orders of the circles that a turn of the board in its plane cannot tell from the given one (row 0).
+
+    Mirrored orders are no symmetry: a board is seen from its front.
+    """
+    return _turns_onto(board, board)
+
+
+def _turns_onto(board: Board, other: Board) -> NDArray[np.intp]:
+    """(S, N) orders `o` so that other.centres[o] is board.centres turned in the plane and shifted."""
+    orders: list[NDArray[np.intp]] = []
+    if len(board.centres) == len(other.centres) and abs(board.circle_radius / other.circle_radius - 1) < SAME_PLACE:
+        limit = SAME_PLACE * board.circle_radius
+        plane, target = (one.centres[:, :2] - one.centres[:, :2].mean(0) for one in (board, other))
+        points, goals = (xy[:, 0] + 1j * xy[:, 1] for xy in (plane, target))
+        anchor = np.abs(points).argmax()
+        for goal in goals:
+            if abs(abs(goal) - abs(points[anchor])) > limit:
+                continue
+            turned = points * (goal / abs(goal)) / (points[anchor] / abs(points[anchor]))
+            gaps = np.abs(turned[:, None] - goals[None])
+            order = gaps.argmin(1)
+            if gaps.min(1).max() <= limit and len(set(order)) == len(order):
+                orders.append(order)
+    orders.sort(key=lambda order: int((order != np.arange(len(order))).sum()))
+    return np.array(orders, dtype=np.intp).reshape(-1, len(board.centres))
+
+
+def layouts(boards: Sequence[Board]) -> list[list[Board]]:
+    """Boards grouped by layout: images alone cannot tell the members of one group apart."""
+    groups: list[list[Board]] = []
+    for board in boards:
+        for group in groups:
+            if len(_turns_onto(group[0], board)):
+                group.append(board)
+                break
+        else:
+            groups.append([board])
+    return groups
+
+
+def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) -> list[BoardObservation]:
+    """Boards of which at least three circles are in the image, known by their own geometry.
+
+    Each ellipse and a circle radius give a place and a normal in space; two of them whose distance and plane fit two
+    circles of a board give its pose; the pose that explains the most ellipses is refined on them. Nothing is known
+    of the camera's place, and clutter does not matter as long as it does not look like three circles of the board
+    in metric places. Mirrored orders do not occur, since poses are proper rotations. Of the two orders of a board
+    that looks the same upside down the one is reported that hangs upright in the image.
+
+    Args:
+        ellipses: ellipses of one image.
+        boards: boards to look for.
+        camera: calibration.
+    """
+    best = np.sort(np.argsort(ellipses.rms, kind="stable")[:MAX_CANDIDATES])
+    free = np.zeros(len(ellipses), bool)
+    free[best] = True
+    matrix, found = camera.matrix, []
+    for board in (group[0] for group in layouts(boards)):
+        for pose, circles, members in _hypotheses(ellipses, free, board, matrix):
+            if not free[members].all():
+                continue
+            fit = _verify(ellipses, free, board, camera, pose, circles, members)
+            if fit is not None:
+                pose, circles, members = fit
+                free[members] = False
+                found.append(_observation(ellipses, board, matrix, *_upright(board, pose, circles), members))
+    return found
+
+
+def identify_predicted(
+    ellipses: TargetEllipses, board: Board, camera: Camera, camera_from_board: FloatArray
+) -> BoardObservation | None:
+    """Circles of a board whose pose is known already, or None where none of them is among the ellipses.
+
+    An ellipse is taken for a circle when its centre lies within half a radius and its semi-axes within a fifth of
+    the predicted ones: wide enough to see a board that contradicts its file, far narrower than the gaps between
+    circles.
+
+    Args:
+        ellipses: ellipses of one image.
+        board: the board.
+        camera: calibration.
+        camera_from_board: (4, 4) predicted pose, m.
+    """
+    depths = (board.centres @ camera_from_board[:3, :3].T + camera_from_board[:3, 3])[:, 2]
+    faces_camera = camera_from_board[:3, 2] @ camera_from_board[:3, 3] < 0
+    if not faces_camera or depths.min() <= board.circle_radius or not len(ellipses):
+        return None
+    circles, members = _matches(ellipses, np.ones(len(ellipses), bool), board, camera.matrix, camera_from_board, 0.5)
+    if not len(circles):
+        return None
+    return _observation(ellipses, board, camera.matrix, camera_from_board, circles, members)
+
+
+def _observation(
+    ellipses: TargetEllipses,
+    board: Board,
+    matrix: FloatArray,
+    pose: FloatArray,
+    circles: NDArray[np.intp],
+    members: NDArray[np.intp],
+) -> BoardObservation:
+    order = np.argsort(circles)
+    circles, members = circles[order], members[order]
+    conics = ellipses.conics[members]
+    # Two of the five parameters of an ellipse through evenly spread points: variance 2 / n of that of a point.
+    sigma = float(np.sqrt(2.0 / PROFILES * np.mean(ellipses.rms[members] ** 2)))
+    centres = circle_centre_images(conics, matrix, pose[:3, 2])
+    return BoardObservation(board.name, circles, centres, ellipses.centres[members], conics, sigma, pose)
+
+
+def _hypotheses(
+    ellipses: TargetEllipses, free: NDArray[np.bool_], board: Board, matrix: FloatArray
+) -> Iterator[tuple[FloatArray, NDArray[np.intp], NDArray[np.intp]]]:
+    """Poses of the board from pairs of ellipses, with the circles that they explain; the best first."""
+    members = np.flatnonzero(free)
+    if len(members) < LEAST_CIRCLES:
+        return
+    places, normals = circles_from_conics(ellipses.conics[members], matrix, board.circle_radius)
+    owners = np.repeat(members, 2)
+    places, normals = places.reshape(-1, 3), normals.reshape(-1, 3)
+    offsets = places[None] - places[:, None]
+    lengths = np.linalg.norm(offsets, axis=-1)
+    means = normals[None] + normals[:, None]
+    means /= np.maximum(np.linalg.norm(means, axis=-1, keepdims=True), 1e-9)
+    slopes = np.einsum("ijk,ijk->ij", offsets, means)
+    # The tilt of a small ellipse is known to some ten degrees only, its distance to some percent.
+    fits = (normals @ normals.T > 0.7) & (np.abs(slopes) < 0.4 * lengths) & (owners[:, None] != owners[None])
+    starts, ends = np.nonzero(fits)
+    lengths, offsets, means = lengths[starts, ends], offsets[starts, ends], means[starts, ends]
+    poses = []
+    for first, second in np.argwhere(~np.eye(len(board.centres), dtype=bool)):
+        edge = board.centres[second] - board.centres[first]
+        distance = np.linalg.norm(edge)
+        chosen = np.flatnonzero(np.abs(lengths / distance - 1.0) < 0.15)
+        along = offsets[chosen] / lengths[chosen, None]
+        normal = means[chosen] - np.einsum("ij,ij->i", means[chosen], along)[:, None] * along
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        across = np.cross(normal, along)
+        cosine, sine = edge[0] / distance, edge[1] / distance
+        pose = np.tile(np.eye(4), (len(chosen), 1, 1))
+        pose[:, :3, 0] = cosine * along - sine * across
+        pose[:, :3, 1] = sine * along + cosine * across
+        pose[:, :3, 2] = normal
+        middle = 0.5 * (places[starts[chosen]] + places[ends[chosen]])
+        pose[:, :3, 3] = middle - pose[:, :3, :3] @ (0.5 * (board.centres[first] + board.centres[second]))
+        poses.append(pose)
+    stack = np.concatenate(poses)
+    predicted = board.centres @ stack[:, :3, :3].transpose(0, 2, 1) + stack[:, None, :3, 3]
+    depths = np.maximum(predicted[..., 2], 1e-6)
+    pixels = (predicted / depths[..., None]) @ matrix[:2].T
+    gaps, nearest = cKDTree(ellipses.centres[members]).query(pixels.reshape(-1, 2))
+    gaps, nearest = gaps.reshape(depths.shape), nearest.reshape(depths.shape)
+    gate = 0.75 * matrix[0, 0] * board.circle_radius / depths
+    matched = (gaps < gate) & (np.abs(places[::2, 2][nearest] / depths - 1.0) < 0.2)
+    scores = matched.sum(1) - 0.5 * np.where(matched, gaps / gate, 0.0).sum(1) / np.maximum(matched.sum(1), 1)
+    seen: set[bytes] = set()
+    for index in np.argsort(-scores, kind="stable"):
+        if matched[index].sum() < LEAST_CIRCLES:
+            return
+        circles = np.flatnonzero(matched[index])
+        chosen = members[nearest[index, circles]]
+        key = np.r_[circles, chosen].tobytes()
+        if key not in seen and len(set(chosen)) == len(chosen):
+            seen.add(key)
+            yield stack[index], circles, chosen
+
+
+def _verify(
+    ellipses: TargetEllipses,
+    free: NDArray[np.bool_],
+    board: Board,
+    camera: Camera,
+    pose: FloatArray,
+    circles: NDArray[np.intp],
+    members: NDArray[np.intp],
+) -> tuple[FloatArray, NDArray[np.intp], NDArray[np.intp]] | None:
+    """The refined pose, its circles and their ellipses, or None where they do not form the board."""
+    matrix = camera.matrix
+    # A plane seen from afar has two poses that look nearly alike: mirrored at the line of sight. Try both.
+    sight = pose[:3, 3] / np.linalg.norm(pose[:3, 3])
+    mirrored = pose.copy()
+    mirrored[:3, :3] = _rotation_between(pose[:3, 2], 2 * (pose[:3, 2] @ sight) * sight - pose[:3, 2]) @ pose[:3, :3]
+    fits = [_refine(ellipses, board, matrix, start, circles, members) for start in (pose, mirrored)]
+    pose = min(fits, key=lambda fit: fit[1])[0]
+    circles, members = _matches(ellipses, free, board, matrix, pose, 0.25)
+    while len(circles) >= LEAST_CIRCLES:
+        pose, _ = _refine(ellipses, board, matrix, pose, circles, members)
+        centres, shapes = project_circles(matrix, pose, board.centres[circles], board.circle_radius)
+        radii = np.sqrt(np.sqrt(np.abs(np.linalg.det(shapes))))
+        errors = np.linalg.norm(centres - ellipses.centres[members], axis=1) / np.maximum(0.06 * radii, 1.0)
+        if errors.max() <= 1.0:
+            break
+        circles, members = np.delete(circles, errors.argmax()), np.delete(members, errors.argmax())
+    if len(circles) < LEAST_CIRCLES:
+        return None
+    # Circles that the image should show as well but does not: some may be hidden, not most of them.
+    centres, shapes = project_circles(matrix, pose, board.centres, board.circle_radius)
+    reach = np.sqrt(np.abs(shapes[:, [0, 1], [0, 1]])) + 4.0
+    within = ((centres > reach) & (centres < np.array([camera.width, camera.height]) - reach)).all(1)
+    return (pose, circles, members) if 2 * len(circles) > within.sum() else None
+
+
+def _matches(
+    ellipses: TargetEllipses,
+    free: NDArray[np.bool_],
+    board: Board,
+    matrix: FloatArray,
+    pose: FloatArray,
+    gate: float,
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Circles and the free ellipses within `gate` radii of where the pose puts them, one for one."""
+    centres, shapes = project_circles(matrix, pose, board.centres, board.circle_radius)
+    predicted = np.sqrt(np.maximum(np.linalg.eigvalsh(shapes), 1e-12))
+    measured = np.sqrt(np.maximum(np.linalg.eigvalsh(ellipses.shapes), 1e-12))
+    gaps = np.linalg.norm(centres[:, None] - ellipses.centres[None], axis=-1) / predicted[:, None, 1]
+    sizes = np.abs(predicted[:, None] - measured[None]).max(-1)
+    gaps[:, ~free] = np.inf
+    gaps[sizes > np.maximum(0.2 * predicted[:, 1], 1.5)[:, None]] = np.inf
+    nearest = gaps.argmin(1)
+    circles = np.flatnonzero((gaps.min(1) < gate) & (gaps.argmin(0)[nearest] == np.arange(len(nearest))))
+    return circles, nearest[circles]
+
+
+def _refine(
+    ellipses: TargetEllipses,
+    board: Board,
+    matrix: FloatArray,
+    pose: FloatArray,
+    circles: NDArray[np.intp],
+    members: NDArray[np.intp],
+) -> tuple[FloatArray, float]:
+    """The pose that fits the ellipses best (damped Gauss-Newton), and its cost.
+
+    Residuals are the centres, to 0.1 px, and the shapes, to 0.5 px: the size of a disc suffers from exposure.
+    """
+    centres, shapes = ellipses.centres[members], ellipses.shapes[members]
+    size = 2 * np.sqrt(np.sqrt(np.abs(np.linalg.det(shapes))))[:, None]
+
+    def residuals(candidate: FloatArray) -> FloatArray:
+        centre, shape = project_circles(matrix, candidate, board.centres[circles], board.circle_radius)
+        bend = (shape - shapes)[:, [0, 1, 0], [0, 1, 1]] / size
+        return np.concatenate([(centre - centres) / 0.1, bend / 0.5], axis=1).ravel()
+
+    steps = np.full(6, 1e-6)
+    steps[3:] *= np.linalg.norm(pose[:3, 3])
+    current = residuals(pose)
+    damping = 1e-3
+    for _ in range(20):
+        jacobian = np.stack([(residuals(_moved(pose, step)) - current) / step.sum() for step in np.diag(steps)], axis=1)
+        normal = jacobian.T @ jacobian
+        gradient = jacobian.T @ current
+        change = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
+        candidate = _moved(pose, change)
+        trial = residuals(candidate)
+        if trial @ trial < current @ current and candidate[2, 3] > board.circle_radius:
+            gain = 1.0 - (trial @ trial) / (current @ current)
+            pose, current, damping = candidate, trial, damping / 10
+            if gain < 1e-6:
+                break
+        else:
+            damping *= 10
+            if damping > 1e6:
+                break
+    return pose, float(current @ current)
+
+
+def _moved(pose: FloatArray, change: FloatArray) -> FloatArray:
+    """The pose turned by the rotation vector change[:3] about the board's origin and shifted by change[3:]."""
+    moved = pose.copy()
+    moved[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ pose[:3, :3]
+    moved[:3, 3] += change[3:]
+    return moved
+
+
+def _rotation_between(start: FloatArray, end: FloatArray) -> FloatArray:
+    """(3, 3) least rotation that takes one unit vector to another."""
+    axis = np.cross(start, end)
+    sine = np.linalg.norm(axis)
+    if sine < 1e-9:
+        return np.eye(3)
+    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, start @ end)).as_matrix()
+
+
+def _upright(board: Board, pose: FloatArray, circles: NDArray[np.intp]) -> tuple[FloatArray, NDArray[np.intp]]:
+    """The pose and circle numbers among those that the board's symmetry allows with y up in the image."""
+    orders = symmetries(board)
+    if len(orders) == 1 or pose[1, 1] <= 0:
+        return pose, circles
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turn[:3, 3] = 2 * board.centres.mean(0)
+    return pose @ turn, orders[1][circles]
