@@ -1,0 +1,197 @@
+"""The reconstruction as a ROS 2 node: keyframes in; map points, poses and overlaps out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Path
+from pipeprog_msgs import msg, srv
+from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.main import run
+from pipeprog_node.parameters import declare
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+
+from pipeprog_frames.camera import Camera
+from pipeprog_frames.errors import InputError
+from pipeprog_node import messages, qos
+from pipeprog_node.worker import WorkerProcess
+from pipeprog_sfm.board import load_boards
+from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.mapper import FrameTie
+from pipeprog_sfm.reconstruction import MetricMap, Status
+from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, serve
+
+MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
+
+
+class SfmNode(Node):
+    """Adapter around the worker process that holds the Reconstruction."""
+
+    def __init__(self) -> None:
+        super().__init__("sfm")
+        config = declare(self, SfmConfig, extra=("board",))
+        board = str(self.declare_parameter("board", "").value)
+        boards = load_boards(board) if board else []
+        self._worker = WorkerProcess(self, serve, (config, boards), self._on_event, self._on_death)
+        self._images: dict[int, CompressedImage] = {}
+        self._cameras: dict[int, tuple[str, Camera]] = {}
+        self._frame_ids: dict[int, str] = {}
+        self._seen = self._done = self._dropped = self._revision = 0
+        self._last_stamp = self._map_stamp = 0
+        self._status: Status | None = None
+        self._finish: tuple[int, Future] | None = None
+        self._finish_sent = False
+
+        self._overlap = self.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.reliable(50))
+        self._points = self.create_publisher(PointCloud2, "map_points", qos.latched())
+        self._poses = self.create_publisher(Path, "keyframe_poses", qos.latched())
+        self._statuses = self.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
+        self.create_subscription(
+            CompressedImage, "keyframes/image/compressed", self._on_image, qos.reliable(MAX_BACKLOG)
+        )
+        self.create_subscription(CameraInfo, "keyframes/camera_info", self._on_camera_info, qos.reliable(MAX_BACKLOG))
+        self.create_service(srv.Finish, "~/finish", self._on_finish)
+        self._diagnostics = Diagnostics(self, "reconstruction", self._health)
+
+    def destroy_node(self) -> None:
+        """Ends the worker with the node."""
+        self._worker.close()
+        super().destroy_node()
+
+    def _on_image(self, message: CompressedImage) -> None:
+        self._images[messages.stamp_ns(message.header.stamp)] = message
+        self._pair(messages.stamp_ns(message.header.stamp))
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        stamp = messages.stamp_ns(message.header.stamp)
+        try:
+            self._cameras[stamp] = (message.header.frame_id, messages.camera_from_info(message))
+        except InputError as error:
+            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+            return
+        self._pair(stamp)
+
+    def _pair(self, stamp: int) -> None:
+        """Hands a keyframe to the worker once image and calibration of one stamp are there."""
+        if stamp not in self._images or stamp not in self._cameras:
+            return
+        image, (frame_id, camera) = self._images.pop(stamp), self._cameras.pop(stamp)
+        self._frame_ids[stamp] = frame_id
+        self._seen += 1
+        self._last_stamp = max(self._last_stamp, stamp)
+        if self._worker.backlog >= MAX_BACKLOG:
+            self._dropped += 1
+            return
+        self._worker.send(Keyframe(stamp, bytes(image.data), camera))
+        self._finish_when_complete()
+
+    async def _on_finish(self, request: srv.Finish.Request, response: srv.Finish.Response) -> srv.Finish.Response:
+        done: Future = Future()
+        self._finish = (request.expected_inputs, done)
+        self._finish_sent = False
+        self._finish_when_complete()
+        problem = await done
+        response.success = not problem
+        response.message = problem
+        response.outputs = self._revision
+        return response
+
+    def _finish_when_complete(self) -> None:
+        if self._finish is not None and not self._finish_sent and self._seen >= self._finish[0]:
+            self._finish_sent = True
+            self._worker.send(Finish())
+
+    def _on_event(self, event: KeyframeDone | MapReady | Finished) -> None:
+        self._status = event.status
+        if isinstance(event, KeyframeDone):
+            self._done += 1
+            self._publish_overlap(event.stamp, event.ties)
+        elif isinstance(event, MapReady):
+            self._revision += 1
+            self._publish_map(event.map)
+        self._publish_status(event.status)
+        if isinstance(event, Finished) and self._finish is not None:
+            self._finish[1].set_result(event.problem)
+            self._finish = None
+
+    def _on_death(self, exit_code: int) -> None:
+        self.get_logger().fatal(f"the reconstruction process died (exit code {exit_code}): the map is lost")
+        raise SystemExit(1)
+
+    def _publish_overlap(self, stamp: int, ties: list[FrameTie]) -> None:
+        self._overlap.publish(
+            msg.ImageOverlapArray(
+                header=messages.header(stamp, self._frame_ids[stamp]),
+                keyframes_considered=self._done,
+                images=[
+                    msg.ImageOverlap(
+                        stamp=messages.time_msg(tie.stamp),
+                        registered=tie.registered,
+                        overlap=tie.overlap,
+                        cell_overlap=tie.cell_overlap,
+                        tie_points=tie.tie_points,
+                        features=tie.features,
+                        matches_previous=tie.matches_previous,
+                        matches_next=tie.matches_next,
+                    )
+                    for tie in ties
+                ],
+            )
+        )
+
+    def _publish_map(self, metric_map: MetricMap) -> None:
+        # Two maps of the same keyframes differ by a nanosecond, so that cloud and poses of one map find each other.
+        self._map_stamp = max(int(metric_map.stamps[-1]), self._map_stamp + 1)
+        header = messages.header(self._map_stamp, "map")
+        cloud = metric_map.cloud
+        self._poses.publish(messages.path(header, metric_map.stamps, metric_map.map_from_camera))
+        self._points.publish(
+            messages.point_cloud(header, cloud.points, colors=cloud.colors, normals=cloud.normals, views=cloud.views)
+        )
+
+    def _publish_status(self, status: Status) -> None:
+        scale = status.scale
+        self._statuses.publish(
+            msg.SfmStatus(
+                header=messages.header(self._last_stamp, "map"),
+                keyframes_seen=status.seen,
+                keyframes_registered=status.registered,
+                keyframes_waiting=status.waiting,
+                models=status.models,
+                map_revision=self._revision,
+                map_stamp=messages.time_msg(self._map_stamp),
+                reprojection_error=status.reprojection_error,
+                metric=scale is not None,
+                scale_source=scale.source if scale else "",
+                scale_sigma=scale.sigma if scale else np.nan,
+                message=status.message,
+            )
+        )
+
+    def _health(self) -> tuple[bytes, str, dict[str, Any]]:
+        status = self._status
+        values: dict[str, Any] = {"keyframes": self._seen, "waiting": self._worker.backlog, "dropped": self._dropped}
+        if status is None:
+            return DiagnosticStatus.OK, "waiting for keyframes", values
+        values |= {
+            "registered": status.registered,
+            "models": status.models,
+            "reprojection error [px]": round(status.reprojection_error, 3),
+            "map revision": self._revision,
+        }
+        if self._dropped or status.message:
+            return DiagnosticStatus.WARN, status.message or "keyframes were dropped: the machine cannot keep up", values
+        return DiagnosticStatus.OK, "mapping", values
+
+
+def main() -> None:
+    """Entry point of sfm_node."""
+    run(SfmNode)
+
+
+if __name__ == "__main__":
+    main()
