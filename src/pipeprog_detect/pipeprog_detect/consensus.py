@@ -1,0 +1,101 @@
+"""Which cylinder the edges of all views agree on: an exhaustive vote, so that no single strong edge decides."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy.ndimage import gaussian_filter1d
+from scipy.stats import qmc
+
+from pipeprog_detect.outline import Stations
+from pipeprog_detect.pipe import FloatArray
+
+# A line belongs to one side of the pipe only while it is nearer to it than to the axis.
+WINDOW_OF_HALF_WIDTH = 0.8
+
+
+def responses(values: FloatArray, offsets: FloatArray, at: Stations) -> FloatArray:
+    """Peaks of the gradient along profiles `values` (N, Q): (N, Q) float32, 0 where none, up to 1 for a clear one.
+
+    Strength saturates at the median of all peaks: where a shadow's edge is ten times stronger than the outline, both
+    count about alike, and agreement over the views decides between them.
+    """
+    slope = np.abs(gaussian_filter1d(np.asarray(values, float), 0.7 / (offsets[1] - offsets[0]), axis=1, order=1))
+    inner = slope[:, 1:-1]
+    peak = (inner >= slope[:, :-2]) & (inner > slope[:, 2:])
+    peak &= np.abs(offsets[None, 1:-1]) <= WINDOW_OF_HALF_WIDTH * at.half_width[:, None]
+    result = np.zeros(values.shape, np.float32)
+    if peak.any():
+        typical = np.median(inner[peak])
+        result[:, 1:-1] = np.where(peak, inner / (inner + typical + 1e-9), 0.0)
+    return result
+
+
+def smeared(response: FloatArray, offsets: FloatArray, at: Stations, width: float) -> FloatArray:
+    """Responses (N, Q) spread by a triangle of half-width `width` px and made neutral: mean 0 inside each window."""
+    step = offsets[1] - offsets[0]
+    taps = np.arange(-int(width / step), int(width / step) + 1) * step
+    result = np.zeros_like(response)
+    for tap in taps:
+        shift = round(tap / step)
+        part = np.roll(response, shift, axis=1) * np.float32(1.0 - abs(tap) / (width + step))
+        np.maximum(result, part, out=result)
+    window = np.abs(offsets[None]) <= WINDOW_OF_HALF_WIDTH * at.half_width[:, None]
+    mean = (result * window).sum(axis=1) / np.maximum(window.sum(axis=1), 1)
+    return np.where(window, result - mean[:, None], np.float32(0.0)).astype(np.float32)
+
+
+@njit(cache=True)
+def _scores(steps: FloatArray, jacobian: FloatArray, response: FloatArray, first: float, step: float) -> FloatArray:
+    """Sum over stations of the response at the displacement that each step (M, 5) causes there."""
+    result = np.zeros(len(steps))
+    last = response.shape[1] - 1
+    for m in range(len(steps)):
+        total = 0.0
+        for n in range(len(jacobian)):
+            offset = 0.0
+            for k in range(5):
+                offset += steps[m, k] * jacobian[n, k]
+            place = (offset - first) / step
+            if place >= 0.0 and place < last:
+                below = int(place)
+                part = place - below
+                total += response[n, below] * (1.0 - part) + response[n, below + 1] * part
+        result[m] = total
+    return result
+
+
+def search(
+    at: Stations,
+    response: FloatArray,
+    offsets: FloatArray,
+    reach: FloatArray,
+    seeds: FloatArray,
+    random: np.random.Generator,
+    elites: int = 96,
+    offspring: int = 32,
+) -> tuple[FloatArray, FloatArray]:
+    """Best steps (E, 5) within +-`reach` (5,) [m] and their scores, best first.
+
+    A Sobol grid over the whole box is scored against widely smeared edges; the best are spread again and again with
+    half the step and half the smear (annealing) down to a third of a pixel. `seeds` (S, 5) join the first grid.
+    """
+    gain = float(np.median(at.gain))
+    half_width = float(np.median(at.half_width))
+    grid = qmc.Sobol(5, seed=random).random(8192) * 2.0 - 1.0
+    population = np.concatenate([np.zeros((1, 5)), seeds, grid * reach])
+    width = max(0.12 * half_width, 1.0)
+    spread = 0.2 * reach
+    first, step = float(offsets[0]), float(offsets[1] - offsets[0])
+    while True:
+        smear = smeared(response, offsets, at, width)
+        score = _scores(population, at.jacobian, smear, first, step)
+        best = np.argsort(-score, kind="stable")[:elites]
+        population, score = population[best], score[best]
+        if spread.max() * gain < 0.2:
+            return population, score
+        cloud = random.normal(size=(len(population), offspring, 5)) * spread
+        children = np.clip(population[:, None] + cloud, -reach, reach).reshape(-1, 5)
+        population = np.concatenate([population, children])
+        spread = 0.6 * spread
+        width = max(0.6 * width, 1.0)
