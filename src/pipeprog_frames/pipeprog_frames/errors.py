@@ -1,5 +1,5 @@
-"""The one exception for what a user can mend."""
+"""Moved to pipeprog_camera, which the packages share without depending in a circle."""
 
+from pipeprog_camera.errors import InputError
 
-class InputError(Exception):
-    """Input that cannot be used: the text names the file, the value and the remedy."""
+__all__ = ["InputError"]

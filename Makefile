@@ -1,0 +1,61 @@
+# pipeprog. `make help` lists what there is; everything lives in .venv, nothing is installed outside this folder.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := out/demo
+
+.DEFAULT_GOAL := help
+.SHELLFLAGS := -eu -c
+.DELETE_ON_ERROR:
+
+# An environment holds absolute paths: one that was copied or moved here is made anew.
+ifneq ($(shell cat $(VENV)/.home 2>/dev/null),$(CURDIR))
+.PHONY: $(VENV)/.home
+endif
+
+INTERFACES := $(wildcard src/pipeprog_msgs/msg/*.msg src/pipeprog_msgs/srv/*.srv)
+PACKAGES := $(wildcard src/*/package.xml src/*/setup.py src/*/setup.cfg src/*/CMakeLists.txt src/*/launch/* src/*/config/*)
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | while IFS="$$(printf '\t')" read -r name what; do printf '  make %-12s %s\n' "$$name" "$$what"; done
+
+setup: $(VENV)/.workspace ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter)
+
+$(VENV)/.home:
+	@$(SHELL) setup/check.sh "$(PYTHON)"
+	@echo "Making the environment in $(VENV) ..."
+	@$(PYTHON) -m venv --clear $(VENV)
+	@printf '%s' "$(CURDIR)" > $@
+
+$(VENV)/.packages: $(VENV)/.home requirements.txt requirements-ros.txt requirements-dev.txt
+	@echo "Installing the Python packages (a few hundred MB the first time) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-ros.txt -r requirements-dev.txt
+	@touch $@
+
+$(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(INTERFACES) $(PACKAGES)
+	@$(SHELL) setup/build.sh $(VENV)
+	@touch $@
+
+demo: setup ## the recording in bags/ through the node graph, and its report
+	@$(BIN)/pipeprog replay bags/demo.mcap --boq bags/demo.boq.yaml --board bags/demo.board.yaml --out $(DEMO) --force
+	@$(BIN)/pipeprog report $(DEMO) --out $(DEMO)/report.html
+
+test: setup ## unit and integration tests
+	@$(BIN)/python -m pytest tests/unit tests/integration
+
+lint: setup ## ruff and mypy
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+accuracy: setup ## accuracy against ground truth (slower than the tests)
+	@$(BIN)/python -m pytest tests/accuracy
+
+experiments: setup ## the paper's four experiments
+	@$(BIN)/python -m benchmarks.experiments
+
+clean: ## remove what was built, the environment included
+	@rm -rf $(VENV) build install log out
+
+.PHONY: help setup demo test lint accuracy experiments clean

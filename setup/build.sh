@@ -1,0 +1,22 @@
+# Builds the workspace into the virtual environment, where ROS 2 itself lies. Usage: build.sh VENV
+set -eu
+venv=$(cd "$1" && pwd -P)
+python=$venv/bin/python
+packages=$("$python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+
+cp setup/pipeprog_start.py "$packages/"
+# .pth files are read in the order of their names: this one before that of the wheels (ros_...).
+echo 'import pipeprog_start' >"$packages/pipeprog_start.pth"
+
+echo "Building the workspace ..."
+export PATH="$venv/bin:$PATH" CMAKE_PREFIX_PATH="$venv" AMENT_PREFIX_PATH="$venv" CMAKE_GENERATOR=Ninja
+if ! "$python" -m colcon --log-base "$venv/log" build \
+    --base-paths src --build-base "$venv/build" --install-base "$venv" --merge-install \
+    --event-handlers console_direct- console_cohesion- summary+ \
+    --cmake-args -DPython3_EXECUTABLE="$python" -DPYTHON_EXECUTABLE="$python" -DBUILD_TESTING=OFF \
+    >"$venv/build.log" 2>&1; then
+    cat "$venv/build.log" >&2
+    echo "The workspace did not build; the log of each package is in $venv/log/latest_build." >&2
+    exit 1
+fi
+ln -sf ../lib/pipeprog_bringup/pipeprog "$venv/bin/pipeprog"

@@ -1,0 +1,29 @@
+# Is this machine fit to build pipeprog? Says what is missing and how to get it. Usage: check.sh PYTHON
+python=$1
+missing=
+
+if ! command -v "$python" >/dev/null; then
+    echo "pipeprog needs Python 3.10 to 3.13, and there is no '$python'." >&2
+    echo "Install python3 (Debian, Ubuntu: apt-get install python3) or name one: make setup PYTHON=python3.12" >&2
+    exit 1
+fi
+if ! "$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))'; then
+    echo "pipeprog needs Python 3.10 to 3.13; '$python' is $("$python" -V 2>&1)." >&2
+    echo "Name another one: make setup PYTHON=python3.12" >&2
+    exit 1
+fi
+if [ "$(uname -sm)" != "Linux x86_64" ]; then
+    echo "The wheels of ROS 2 are for Linux on x86-64, and this is $(uname -sm)." >&2
+    echo "Build src/ with colcon on an installed ROS 2 Jazzy instead: see CONTRIBUTING.md." >&2
+    exit 1
+fi
+version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+"$python" -c 'import venv, ensurepip' 2>/dev/null || missing="$missing python$version-venv"
+"$python" -c 'import os, sys, sysconfig; sys.exit(not os.path.isfile(os.path.join(sysconfig.get_path("include"), "Python.h")))' ||
+    missing="$missing python$version-dev"
+command -v c++ >/dev/null && command -v cc >/dev/null || missing="$missing g++"
+if [ -n "$missing" ]; then
+    echo "To build the ROS 2 messages, this machine lacks:$missing" >&2
+    echo "Debian, Ubuntu: apt-get install$missing" >&2
+    exit 1
+fi

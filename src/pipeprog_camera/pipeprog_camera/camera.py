@@ -1,0 +1,144 @@
+"""A calibrated camera, as sensor_msgs/CameraInfo describes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeprog_camera.errors import InputError
+
+# Number of coefficients that each ROS distortion model may carry.
+DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
+    "plumb_bob": (0, 4, 5),
+    "rational_polynomial": (8, 12, 14),
+    "equidistant": (4,),
+}
+_ALIASES = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant", "none": "plumb_bob"}
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera with lens distortion; pixel centres lie at integer coordinates (ROS, OpenCV).
+
+    Focal lengths and principal point are in pixels, distortion coefficients in OpenCV's order.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str = "plumb_bob"
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0:
+            raise InputError(f"camera size {self.width} x {self.height} is no image size: set width and height")
+        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
+            raise InputError(
+                f"camera is not calibrated (fx = {self.fx:g}, fy = {self.fy:g}): "
+                "calibrate it and fill K of its CameraInfo"
+            )
+        model = _ALIASES.get(self.distortion_model, self.distortion_model)
+        if model not in DISTORTION_MODELS:
+            raise InputError(
+                f"unknown distortion model '{self.distortion_model}': use one of {', '.join(DISTORTION_MODELS)}"
+            )
+        coefficients = tuple(float(value) for value in self.distortion)
+        if len(coefficients) not in DISTORTION_MODELS[model] and any(coefficients):
+            raise InputError(
+                f"distortion model {model} takes {DISTORTION_MODELS[model]} coefficients, not {len(coefficients)}"
+            )
+        if not np.isfinite(coefficients).all():
+            raise InputError(f"distortion coefficients {coefficients} are not finite: calibrate the camera again")
+        object.__setattr__(self, "distortion_model", model)
+        object.__setattr__(self, "distortion", coefficients)
+
+    @classmethod
+    def from_calibration(
+        cls,
+        width: int,
+        height: int,
+        k: ArrayLike,
+        distortion_model: str = "plumb_bob",
+        distortion: Sequence[float] = (),
+    ) -> Camera:
+        """Camera from the row-major (3, 3) or (9,) matrix K; raises InputError where it is not calibrated."""
+        matrix = np.asarray(k, float).reshape(3, 3)
+        return cls(
+            int(width),
+            int(height),
+            matrix[0, 0],
+            matrix[1, 1],
+            matrix[0, 2],
+            matrix[1, 2],
+            distortion_model,
+            tuple(distortion),
+        )
+
+    @property
+    def matrix(self) -> FloatArray:
+        """The (3, 3) matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether any coefficient is not zero."""
+        return any(self.distortion)
+
+    def undistort_points(self, pixels: ArrayLike) -> FloatArray:
+        """(N, 2) pixels of the image -> (N, 2) pixels of the ideal pinhole camera with the same K."""
+        points = np.asarray(pixels, float).reshape(-1, 1, 2)
+        if not self.is_distorted or not len(points):
+            return points.reshape(-1, 2)
+        coefficients = np.asarray(self.distortion)
+        if self.distortion_model == "equidistant":
+            return cv2.fisheye.undistortPoints(points, self.matrix, coefficients, P=self.matrix).reshape(-1, 2)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+        return cv2.undistortPointsIter(points, self.matrix, coefficients, None, self.matrix, criteria).reshape(-1, 2)
+
+    def distort_points(self, pixels: ArrayLike) -> FloatArray:
+        """(N, 2) pixels of the ideal pinhole camera -> (N, 2) pixels of the image."""
+        points = np.asarray(pixels, float).reshape(-1, 2)
+        if not self.is_distorted or not len(points):
+            return points
+        rays = np.c_[(points[:, 0] - self.cx) / self.fx, (points[:, 1] - self.cy) / self.fy]
+        coefficients = np.asarray(self.distortion)
+        if self.distortion_model == "equidistant":
+            return cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), self.matrix, coefficients).reshape(-1, 2)
+        zero = np.zeros(3)
+        return cv2.projectPoints(np.c_[rays, np.ones(len(rays))], zero, zero, self.matrix, coefficients)[0].reshape(
+            -1, 2
+        )
+
+    def undistort_image(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image as the ideal pinhole camera with the same K and size sees it."""
+        if not self.is_distorted:
+            return image
+        coefficients = np.asarray(self.distortion)
+        if self.distortion_model == "equidistant":
+            return cv2.fisheye.undistortImage(image, self.matrix, coefficients, Knew=self.matrix)
+        return cv2.undistort(image, self.matrix, coefficients)
+
+    def pinhole(self) -> Camera:
+        """The ideal camera with the same K and no distortion."""
+        return replace(self, distortion_model="plumb_bob", distortion=())
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera of the image resized by `factor` (pixel areas align, so the half pixel scales too)."""
+        return replace(
+            self,
+            width=round(self.width * factor),
+            height=round(self.height * factor),
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=(self.cx + 0.5) * factor - 0.5,
+            cy=(self.cy + 0.5) * factor - 0.5,
+        )

@@ -1,0 +1,20 @@
+from setuptools import find_packages, setup
+
+package_name = "pipeprog_frames"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="pipeprog developers",
+    maintainer_email="maintainers@pipeprog.dev",
+    description="Which frames of a video are worth reconstructing: overlap tracker, keyframe selector and their node.",
+    license="Apache-2.0",
+    entry_points={"console_scripts": ["frames_node = pipeprog_frames.node:main"]},
+)
