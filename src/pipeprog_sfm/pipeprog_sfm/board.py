@@ -129,7 +129,7 @@ def _board(value: Any, where: str) -> Board:
     turns = len(symmetries(board))
     if turns > 2:
         raise InputError(
-            f"{where}: the layout looks the same {turns} ways round, so its circles cannot be told apart: move one circle"
+            f"{where}: the layout looks the same {turns} ways round, and its circles cannot be told apart: move one"
         )
     return board
 
