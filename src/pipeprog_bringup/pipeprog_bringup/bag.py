@@ -11,8 +11,8 @@ import yaml
 
 from pipeprog_bringup import cdr
 from pipeprog_bringup.mcap_file import McapFile, Message
-from pipeprog_frames.camera import Camera
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 
 _IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
 # Depth and disparity images travel as the same message types; no camera's picture has these encodings.

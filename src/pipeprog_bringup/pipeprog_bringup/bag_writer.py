@@ -11,7 +11,7 @@ from typing import BinaryIO
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.errors import InputError
 
 _PRIMITIVES = frozenset(
     ["bool", "byte", "char", "string", "wstring", "float32", "float64"]

@@ -10,7 +10,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from pipeprog_bringup import cdr
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 START = 1_700_000_000_000_000_000

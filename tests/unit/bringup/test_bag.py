@@ -23,7 +23,7 @@ from tests.unit.bringup.recordings import (
 from pipeprog_bringup import cdr
 from pipeprog_bringup.bag import Bag
 from pipeprog_bringup.bag_writer import BagWriter, message_definition
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.errors import InputError
 
 IMAGES = [image(number) for number in range(8)]
 LAYOUTS = {

@@ -1,0 +1,195 @@
+"""The files of a run, as DESIGN and docs/architecture.md fix them: writers, and readers of what scoring needs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.pipe import Pipe
+
+FloatArray = NDArray[np.float64]
+
+FRAME_COLUMNS = ("stamp", "chosen", "reason", "overlap_n", "overlap_predicted", "parallax", "sharpness", "registered")
+_PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "pycolmap", "mcap", "ros-rclpy")
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where the metres come from, and their relative standard deviation (None: not known)."""
+
+    source: str
+    sigma: float | None
+
+
+@dataclass(frozen=True)
+class ClassProgress:
+    """One class of the bill: outer radius [m], planned and installed length [m], colour (r, g, b) in [0, 1]."""
+
+    name: str
+    outer_radius: float
+    planned: float
+    installed: float
+    color: tuple[float, float, float]
+
+    @property
+    def percent(self) -> float | None:
+        """Installed share of what is planned [%]; None where nothing is planned."""
+        return 100 * self.installed / self.planned if self.planned > 0 else None
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """One frame that was considered; numbers are None where they are not known."""
+
+    stamp: int
+    chosen: bool
+    reason: str
+    overlap_n: float | None = None
+    overlap_predicted: float | None = None
+    parallax: float | None = None
+    sharpness: float | None = None
+    registered: bool | None = None
+
+
+def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress], scale: Scale) -> None:
+    """pipes.json; lengths rounded to the micrometre, so that it reads well and stays the same on every machine."""
+    content = {
+        "frame_id": "map",
+        "scale": {"source": scale.source, "sigma": _significant(scale.sigma)},
+        "pipes": [_pipe_entry(pipe) for pipe in pipes],
+        "classes": [
+            {
+                "class": entry.name,
+                "outer_radius": round(entry.outer_radius, 6),
+                "planned_m": round(entry.planned, 6),
+                "installed_m": round(entry.installed, 6),
+                "percent": None if entry.percent is None else round(entry.percent, 2),
+            }
+            for entry in classes
+        ],
+    }
+    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def write_progress(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress]) -> None:
+    """progress.csv: one line a class, for a spreadsheet."""
+    with path.open("w", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes"])
+        for entry in classes:
+            count = sum(pipe.class_name == entry.name for pipe in pipes)
+            percent = "" if entry.percent is None else f"{entry.percent:.1f}"
+            row = [entry.name, f"{1e3 * entry.outer_radius:.2f}", f"{entry.planned:.3f}", f"{entry.installed:.3f}"]
+            writer.writerow([*row, percent, count])
+
+
+def write_trajectory(path: Path, stamps: Sequence[int], translations: FloatArray, quaternions: FloatArray) -> None:
+    """trajectory.tum: stamps [ns], camera positions (N, 3) [m] and orientations (N, 4) x y z w in `map`."""
+    with path.open("w") as stream:
+        for stamp, position, quaternion in zip(stamps, translations, quaternions, strict=True):
+            numbers = " ".join(f"{value:.9f}" for value in (*position, *quaternion))
+            stream.write(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers}\n")
+
+
+def write_frames(path: Path, rows: Iterable[FrameRow]) -> None:
+    """frames.csv: every frame considered, in the order of the recording; the stamp in ns."""
+    with path.open("w", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(FRAME_COLUMNS)
+        for row in rows:
+            numbers = (row.overlap_n, row.overlap_predicted, row.parallax, row.sharpness)
+            cells = ["" if value is None or not np.isfinite(value) else f"{value:.4f}" for value in numbers]
+            registered = "" if row.registered is None else int(row.registered)
+            writer.writerow([row.stamp, int(row.chosen), row.reason, *cells, registered])
+
+
+def write_config(path: Path, config: dict[str, Any]) -> None:
+    """config.yaml: the settings in force."""
+    path.write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+
+
+def write_run(path: Path, facts: dict[str, Any]) -> None:
+    """run.json: what ran, on what, for how long; versions are added here."""
+    versions = {"python": platform.python_version(), "pipeprog": package_version("pipeprog_bringup")}
+    versions.update({name: package_version(name) for name in _PACKAGES})
+    path.write_text(json.dumps({**facts, "versions": versions}, indent=1) + "\n")
+
+
+def package_version(name: str) -> str | None:
+    """Version of an installed package, None where it is not installed as one."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def read_trajectory(path: Path) -> tuple[NDArray[np.int64], FloatArray]:
+    """Stamps (N,) [ns] and poses map_from_camera (N, 4, 4) of a trajectory.tum; raises InputError where it is none."""
+    from scipy.spatial.transform import Rotation
+
+    stamps, rows = [], []
+    for number, line in enumerate(_lines(path), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            stamps.append(int(Decimal(words[0]) * 10**9))
+            rows.append([float(word) for word in words[1:]])
+        except (ValueError, OverflowError, InvalidOperation):
+            rows.append([])
+        if len(rows[-1]) != 7 or not np.isfinite(rows[-1]).all() or not any(rows[-1][3:]):
+            raise InputError(f"{path}, line {number}: '{line.strip()}' is not `t tx ty tz qx qy qz qw`")
+    values = np.asarray(rows, float).reshape(-1, 7)
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    if len(values):
+        poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
+        poses[:, :3, 3] = values[:, :3]
+    return np.asarray(stamps, np.int64), poses
+
+
+def read_frame_stamps(path: Path) -> NDArray[np.int64]:
+    """Stamps (N,) [ns] of the frames in a frames.csv; raises InputError where it is none."""
+    try:
+        return np.array([int(row["stamp"]) for row in csv.DictReader(_lines(path))], np.int64)
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(f"{path} is no frames.csv ({error}): run `pipeprog replay` again") from None
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+
+
+def _pipe_entry(pipe: Pipe) -> dict[str, Any]:
+    return {
+        "id": pipe.id,
+        "start": [round(float(value), 6) for value in pipe.cylinder.start],
+        "end": [round(float(value), 6) for value in pipe.cylinder.end],
+        "radius": round(pipe.cylinder.radius, 6),
+        "radius_sigma": _significant(pipe.radius_sigma),
+        "length": round(pipe.cylinder.length, 6),
+        "class": pipe.class_name,
+        "class_probability": round(pipe.class_probability, 4),
+        "visible_arc_deg": round(float(np.degrees(pipe.visible_arc)), 1),
+        "rmse": _significant(pipe.rmse),
+        "points": int(pipe.points),
+    }
+
+
+def _significant(value: float | None) -> float | None:
+    """Four significant digits, None for what is not a number."""
+    return None if value is None or not np.isfinite(value) else float(f"{value:.4g}")

@@ -1,0 +1,369 @@
+"""Score a result against ground truth: found, classified, radius (Eq. 4), length (Eq. 5), scale, trajectory.
+
+Equations of Maalek, Lichti & Maalek; Eq. 4 is taken with the square that the paper's print lacks. A pipe is found by
+the one-to-one match of its axis; its radius and its class play no part in that, so detection and classification are
+scored apart.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from pipeprog_bringup.results import read_frame_stamps, read_trajectory
+from pipeprog_camera.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+# When a detection is a pipe of the truth: axes nearer than the larger of the radius and 20 mm, angle under 3 degrees,
+# the common stretch over half of either length.
+AXIS_DISTANCE_MIN = 0.02
+ANGLE_MAX = np.radians(3.0)
+OVERLAP_MIN = 0.5
+# A cylinder to be ignored is a stub, whose direction nobody can measure as well as that of a pipe.
+IGNORE_ANGLE_MAX = np.radians(15.0)
+# A true radius belongs to the class within the tolerance of manufacture (1 % of the diameter, EN 10255).
+CLASS_TOLERANCE = 0.01
+# Stamps in trajectory.tum are seconds as decimals; other tools round them to milliseconds at worst.
+STAMP_TOLERANCE = 1_000_000
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A cylinder of the truth or of the result: ends (3,) [m], radius [m], length [m], id, class or None."""
+
+    start: FloatArray
+    end: FloatArray
+    radius: float
+    length: float
+    id: str
+    class_name: str | None = None
+
+
+@dataclass(frozen=True)
+class Result:
+    """What pipes.json says: detections in `map`, and the classes' radii [m]."""
+
+    pipes: tuple[Segment, ...]
+    class_radii: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth in its own frame `world`: pipes, cylinders to ignore, poses (N, 4, 4) of each frame's camera."""
+
+    pipes: tuple[Segment, ...]
+    ignore: tuple[Segment, ...]
+    world_from_camera: FloatArray
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """How the cameras fit the truth after alignment: `scale_error` relative, residuals [m]."""
+
+    world_from_map: FloatArray
+    poses: int
+    scale_error: float
+    rms_rigid: float
+    rms_similarity: float
+    max_similarity: float
+
+
+def score_files(pipes_json: Path, truth_json: Path) -> dict[str, Any]:
+    """Score `pipes_json`, aligned by the trajectory.tum and frames.csv beside it (identity where there is none).
+
+    Frames correspond by their number: row i of frames.csv is the truth's pose i. Raises InputError where a file cannot
+    be read or the trajectory cannot be laid onto the truth.
+    """
+    result, truth = read_result(pipes_json), read_truth(truth_json)
+    trajectory_file = pipes_json.parent / "trajectory.tum"
+    trajectory = None
+    if trajectory_file.exists() and len(truth.world_from_camera):
+        trajectory = align(*_pairs(trajectory_file, truth_json, truth))
+    return score(result, truth, trajectory)
+
+
+def score(result: Result, truth: Truth, trajectory: Trajectory | None = None) -> dict[str, Any]:
+    """All figures as plain numbers, strings and lists; None where there is nothing to take a figure of.
+
+    `detection` counts every detection; in `planned` only those with a class count, so a cylinder that was left without
+    a class is not a false one there; in `classification` a match counts only with the right class.
+    """
+    world_from_map = np.eye(4) if trajectory is None else trajectory.world_from_map
+    found = [_moved(pipe, world_from_map) for pipe in result.pipes]
+    matches = match(found, truth.pipes)
+    unmatched = [i for i in range(len(found)) if i not in matches]
+    ignored = {i for i in unmatched if any(_is_ignored(found[i], other) for other in truth.ignore)}
+    false = [i for i in unmatched if i not in ignored]
+    true_classes = [_class_of(pipe.radius, result.class_radii) for pipe in truth.pipes]
+    planned = [i for i in matches if found[i].class_name is not None]
+    right = [i for i in planned if found[i].class_name in true_classes[matches[i]]]
+    false_planned = sum(found[i].class_name is not None for i in false)
+    of_a_class = sum(bool(names) for names in true_classes)
+    errors = [_errors(found[i], truth.pipes[j]) for i, j in sorted(matches.items(), key=lambda pair: pair[1])]
+    return {
+        "alignment": "identity" if trajectory is None else "trajectory",
+        "detection": _rates(len(matches), len(false), len(truth.pipes) - len(matches)),
+        "planned": _rates(len(planned), false_planned, len(truth.pipes) - len(planned)),
+        "classification": {
+            **_rates(len(right), len(planned) - len(right) + false_planned, of_a_class - len(right)),
+            "right_of_matched": _ratio(len(right), len(matches)),
+        },
+        "ignored": len(ignored),
+        "radius": _radius_figures(errors),
+        "length": _length_figures(errors, found, ignored, truth, result.class_radii, true_classes),
+        "scale": {"error_percent": None if trajectory is None else 100 * trajectory.scale_error},
+        "trajectory": None if trajectory is None else _trajectory_figures(trajectory),
+        "pipes": errors,
+        "missed": [pipe.id for j, pipe in enumerate(truth.pipes) if j not in matches.values()],
+        "false": [found[i].id for i in false],
+    }
+
+
+def match(found: Sequence[Segment], truth: Sequence[Segment]) -> dict[int, int]:
+    """One-to-one {detection: true pipe}: as many as possible, then those that agree best along the axis."""
+    weights = np.zeros((len(found), len(truth)))
+    for i, detection in enumerate(found):
+        for j, pipe in enumerate(truth):
+            angle, distance, overlap = relation(detection, pipe)
+            limit = max(pipe.radius, AXIS_DISTANCE_MIN)
+            if angle < ANGLE_MAX and distance < limit and overlap > OVERLAP_MIN * max(pipe.length, detection.length):
+                # Agreement lies in (0, 2): with 4 for each match, two matches always outweigh one that agrees better.
+                weights[i, j] = 4 + overlap / max(pipe.length, detection.length) + 1 - distance / limit
+    rows, columns = linear_sum_assignment(-weights)
+    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if weights[i, j] > 0}
+
+
+def relation(detection: Segment, pipe: Segment) -> tuple[float, float, float]:
+    """Angle between the axes [rad], their distance in the middle of the common stretch [m], its length [m]."""
+    axis = (pipe.end - pipe.start) / np.linalg.norm(pipe.end - pipe.start)
+    direction = (detection.end - detection.start) / np.linalg.norm(detection.end - detection.start)
+    angle = float(np.arctan2(np.linalg.norm(np.cross(axis, direction)), abs(axis @ direction)))
+    stretch = sorted(float((end - pipe.start) @ axis) for end in (detection.start, detection.end))
+    low, high = max(stretch[0], 0.0), min(stretch[1], float(np.linalg.norm(pipe.end - pipe.start)))
+    middle = pipe.start + axis * (low + high) / 2
+    distance = float(np.linalg.norm(np.cross(middle - detection.start, direction)))
+    return angle, distance, max(high - low, 0.0)
+
+
+def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Trajectory:
+    """Lay a trajectory onto the truth, poses (N, 4, 4) each.
+
+    The rigid motion for the pipes is fitted to positions and directions together: on a straight walk the positions
+    alone leave the turn about the walk open. Scale and residuals are of the positions alone (Umeyama 1991).
+    """
+    positions, true_positions = map_from_camera[:, :3, 3], world_from_camera[:, :3, 3]
+    spread = float(np.sqrt(((true_positions - true_positions.mean(0)) ** 2).sum(1).mean()))
+    if len(positions) < 3 or spread < 1e-3:
+        raise InputError(f"{len(positions)} poses within {spread * 1e3:.1f} mm are too few to align with the truth")
+    tripod = np.array([[0, 0, 0, 1], [spread, 0, 0, 1], [0, spread, 0, 1], [0, 0, spread, 1]]).T
+    corners = np.swapaxes(map_from_camera @ tripod, 1, 2)[..., :3].reshape(-1, 3)
+    true_corners = np.swapaxes(world_from_camera @ tripod, 1, 2)[..., :3].reshape(-1, 3)
+    rigid_residuals = _residuals(positions, true_positions, _umeyama(positions, true_positions, scaled=False))
+    world_from_map = _umeyama(positions, true_positions, scaled=True)
+    residuals = _residuals(positions, true_positions, world_from_map)
+    return Trajectory(
+        world_from_map=_umeyama(corners, true_corners, scaled=False),
+        poses=len(positions),
+        scale_error=1 / float(np.cbrt(np.linalg.det(world_from_map[:3, :3]))) - 1,
+        rms_rigid=_rms(rigid_residuals),
+        rms_similarity=_rms(residuals),
+        max_similarity=float(residuals.max()),
+    )
+
+
+def read_result(path: Path) -> Result:
+    """The pipes.json of a run; raises InputError where it is none."""
+    content = _read_json(path)
+    try:
+        pipes = tuple(_segment(path, pipe, str(pipe["id"]), pipe.get("class")) for pipe in content["pipes"])
+        class_radii = {str(entry["class"]): float(entry["outer_radius"]) for entry in content["classes"]}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{path} is no pipes.json of pipeprog ({_named(error)}): run `pipeprog replay` again"
+        ) from None
+    unknown = sorted({pipe.class_name for pipe in pipes if pipe.class_name is not None} - set(class_radii))
+    if unknown:
+        raise InputError(f"{path}: class {unknown[0]} of a pipe is not among its classes: run `pipeprog replay` again")
+    return Result(pipes, class_radii)
+
+
+def read_truth(path: Path) -> Truth:
+    """A truth file; raises InputError where it is none."""
+    content = _read_json(path)
+    try:
+        pipes = tuple(_segment(path, pipe, str(pipe.get("id", i))) for i, pipe in enumerate(content["pipes"]))
+        ignore = tuple(_segment(path, pipe, "ignore") for pipe in content.get("ignore", []))
+        poses = np.asarray(content.get("camera_to_world", []), float).reshape(-1, 4, 4)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} is no truth file ({_named(error)}): it needs pipes with start, end, radius") from None
+    return Truth(pipes, ignore, poses)
+
+
+def _pairs(trajectory_file: Path, truth_json: Path, truth: Truth) -> tuple[FloatArray, FloatArray]:
+    """Poses of the run and of the truth that belong together."""
+    stamps, map_from_camera = read_trajectory(trajectory_file)
+    frame_stamps = read_frame_stamps(trajectory_file.parent / "frames.csv")
+    if len(frame_stamps) > len(truth.world_from_camera):
+        raise InputError(
+            f"{truth_json} has {len(truth.world_from_camera)} poses but {trajectory_file.parent / 'frames.csv'} "
+            f"{len(frame_stamps)} frames: it is the truth of another recording"
+        )
+    unique, first = np.unique(frame_stamps, return_index=True)
+    if not len(stamps) or not len(unique):
+        raise InputError(f"{trajectory_file} holds no poses: nothing was reconstructed")
+    after = np.clip(np.searchsorted(unique, stamps), 1, max(len(unique) - 1, 1))
+    candidates = np.stack([np.minimum(after, len(unique) - 1), after - 1])
+    gaps = np.abs(unique[candidates] - stamps)
+    nearest = np.take_along_axis(candidates, gaps.argmin(0)[None], 0)[0]
+    near = gaps.min(0) <= STAMP_TOLERANCE
+    return map_from_camera[near], truth.world_from_camera[first[nearest[near]]]
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InputError(f"no such file: {path}") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path} is not JSON that can be read: {error}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path} holds a {type(content).__name__} where a JSON object belongs")
+    return content
+
+
+def _segment(path: Path, entry: dict[str, Any], name: str, class_name: str | None = None) -> Segment:
+    start, end = (np.asarray(entry[key], float).reshape(3) for key in ("start", "end"))
+    radius, distance = float(entry["radius"]), float(np.linalg.norm(end - start))
+    if not (np.isfinite([*start, *end, radius]).all() and radius > 0 and distance > 0):
+        raise InputError(f"{path}: pipe {name} has no length or radius, or numbers that are not finite")
+    return Segment(start, end, radius, float(entry.get("length", distance)), name, class_name)
+
+
+def _named(error: Exception) -> str:
+    return f"{error} is missing" if isinstance(error, KeyError) else str(error)
+
+
+def _moved(pipe: Segment, world_from_map: FloatArray) -> Segment:
+    rotation, shift = world_from_map[:3, :3], world_from_map[:3, 3]
+    ends = rotation @ pipe.start + shift, rotation @ pipe.end + shift
+    return Segment(*ends, pipe.radius, pipe.length, pipe.id, pipe.class_name)
+
+
+def _is_ignored(detection: Segment, other: Segment) -> bool:
+    angle, distance, overlap = relation(detection, other)
+    near = distance < max(other.radius, AXIS_DISTANCE_MIN)
+    return angle < IGNORE_ANGLE_MAX and near and overlap > OVERLAP_MIN * min(other.length, detection.length)
+
+
+def _class_of(radius: float, class_radii: dict[str, float]) -> list[str]:
+    """Classes that a true radius belongs to: none, one, or those that share it."""
+    if not class_radii:
+        return []
+    nearest = min(abs(planned - radius) for planned in class_radii.values())
+    if nearest > CLASS_TOLERANCE * radius:
+        return []
+    return [name for name, planned in class_radii.items() if abs(planned - radius) <= nearest + 1e-9]
+
+
+def _errors(detection: Segment, pipe: Segment) -> dict[str, Any]:
+    angle, distance, _ = relation(detection, pipe)
+    return {
+        "id": detection.id,
+        "truth": pipe.id,
+        "class": detection.class_name,
+        "true_radius": pipe.radius,
+        "true_length": pipe.length,
+        "radius_error_mm": 1e3 * (detection.radius - pipe.radius),
+        "length_error_percent": 100 * (detection.length - pipe.length) / pipe.length,
+        "axis_distance_mm": 1e3 * distance,
+        "angle_deg": float(np.degrees(angle)),
+    }
+
+
+def _rates(true: int, false: int, missed: int) -> dict[str, Any]:
+    return {
+        "true_positives": true,
+        "false_positives": false,
+        "false_negatives": missed,
+        "precision": _ratio(true, true + false),
+        "recall": _ratio(true, true + missed),
+        "f_measure": _ratio(2 * true, 2 * true + false + missed),
+        "accuracy": _ratio(true, true + false + missed),
+    }
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+def _radius_figures(errors: list[dict[str, Any]]) -> dict[str, Any]:
+    by_radius = {radius: [e for e in errors if e["true_radius"] == radius] for radius in _radii(errors)}
+    figures = [
+        {"radius_mm": 1e3 * radius, "pipes": len(group), "rmse_mm": _rms([e["radius_error_mm"] for e in group])}
+        for radius, group in by_radius.items()
+    ]
+    values = [e["radius_error_mm"] for e in errors]
+    bias = float(np.mean(values)) if values else None
+    return {"rmse_mm": _rms(values) if values else None, "bias_mm": bias, "per_class": figures}
+
+
+def _length_figures(
+    errors: list[dict[str, Any]],
+    found: list[Segment],
+    ignored: set[int],
+    truth: Truth,
+    class_radii: dict[str, float],
+    true_classes: list[list[str]],
+) -> dict[str, Any]:
+    """Mean absolute error a pipe (Eq. 5), and per class the metres that the report would bill against the true ones."""
+    per_class = []
+    for name in class_radii:
+        true = sum(pipe.length for pipe, names in zip(truth.pipes, true_classes, strict=True) if name in names)
+        measured = sum(pipe.length for i, pipe in enumerate(found) if pipe.class_name == name and i not in ignored)
+        error = 100 * (measured - true) / true if true else None
+        per_class.append({"class": name, "true_m": true, "measured_m": measured, "error_percent": error})
+    values = [abs(e["length_error_percent"]) for e in errors]
+    return {"mean_error_percent": float(np.mean(values)) if values else None, "per_class": per_class}
+
+
+def _trajectory_figures(trajectory: Trajectory) -> dict[str, Any]:
+    return {
+        "poses": trajectory.poses,
+        "rms_rigid_mm": 1e3 * trajectory.rms_rigid,
+        "rms_similarity_mm": 1e3 * trajectory.rms_similarity,
+        "max_similarity_mm": 1e3 * trajectory.max_similarity,
+    }
+
+
+def _radii(errors: list[dict[str, Any]]) -> list[float]:
+    return sorted({e["true_radius"] for e in errors})
+
+
+def _rms(values: Sequence[float] | FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _residuals(points: FloatArray, true_points: FloatArray, transform: FloatArray) -> FloatArray:
+    return np.linalg.norm(points @ transform[:3, :3].T + transform[:3, 3] - true_points, axis=1)
+
+
+def _umeyama(points: FloatArray, true_points: FloatArray, scaled: bool) -> FloatArray:
+    """(4, 4) similarity or rigid motion that lays `points` (N, 3) onto `true_points` with least squares."""
+    centre, true_centre = points.mean(0), true_points.mean(0)
+    p, q = points - centre, true_points - true_centre
+    u, singular, vt = np.linalg.svd(q.T @ p)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u * signs @ vt
+    scale = (singular * signs).sum() / (p**2).sum() if scaled else 1.0
+    transform = np.eye(4)
+    transform[:3, :3] = scale * rotation
+    transform[:3, 3] = true_centre - scale * rotation @ centre
+    return transform
