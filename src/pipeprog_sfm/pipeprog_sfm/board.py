@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from pipeprog_frames.camera import Camera
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_sfm.conic import FloatArray, circle_centre_images, circles_from_conics, project_circles
 from pipeprog_sfm.ellipse import PROFILES, TargetEllipses
 

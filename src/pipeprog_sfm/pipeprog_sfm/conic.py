@@ -58,8 +58,8 @@ def project_circles(
     homographies = np.empty((len(centres), 3, 3))
     homographies[:, :, :2] = rotation[:, :2]
     homographies[:, :, 2] = centres @ rotation.T + translation
-    homographies = camera_matrix @ homographies
-    return ellipse_from_dual((homographies * np.array([1.0, 1.0, -1.0 / radius**2])) @ homographies.transpose(0, 2, 1))
+    images = camera_matrix @ homographies
+    return ellipse_from_dual((images * np.array([1.0, 1.0, -1.0 / radius**2])) @ images.transpose(0, 2, 1))
 
 
 def circle_centre_images(conics: FloatArray, camera_matrix: FloatArray, normals: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.conic import FloatArray, axes_and_angle, conic_from_ellipse
 
@@ -58,17 +58,19 @@ def find_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig) 
         config: smallest disc to look for.
     """
     candidates = _candidates(gray, config)
-    centres, shapes, rms = candidates[:, :2], _shapes(candidates), np.empty(len(candidates))
+    centres: FloatArray = candidates[:, :2]
+    shapes: FloatArray = _shapes(candidates)
+    rms: FloatArray = np.zeros(len(candidates))
     for lens in (camera.pinhole(), camera):  # the first round stays in the image: its ellipses guide the second
         if not len(centres):
             break
         points, weights = _edge_points(gray, centres, shapes)
         undistorted = lens.undistort_points(points.reshape(-1, 2)).reshape(points.shape)
         centres, shapes, rms, good = _fit(undistorted, weights)
-        kept = good & _plausible(shapes, config)
-        centres, shapes, rms = centres[kept], shapes[kept], rms[kept]
-    kept = _first_of_each(centres, shapes, rms)
-    return TargetEllipses(centres[kept], shapes[kept], rms[kept])
+        good &= _plausible(shapes, config)
+        centres, shapes, rms = centres[good], shapes[good], rms[good]
+    single = _first_of_each(centres, shapes, rms)
+    return TargetEllipses(centres[single], shapes[single], rms[single])
 
 
 def _candidates(gray: NDArray[np.uint8], config: BoardConfig) -> FloatArray:

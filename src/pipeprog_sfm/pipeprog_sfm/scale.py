@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 from pipeprog_sfm.board import Board, BoardObservation, identify_predicted, layouts, symmetries
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.conic import FloatArray, circle_centre_images
 from pipeprog_sfm.ellipse import TargetEllipses
 
-# x to the right along the wall, y into it, z up: REP 103 for a board whose y axis points up and whose front looks at us.
+# x to the right along the wall, y into it, z up (REP 103), for a board whose y axis points up.
 MAP_FROM_BOARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 # Errors before any residual is seen, and how many residuals that knowledge is worth: an edge-fitted centre, and the
@@ -35,8 +35,8 @@ LARGEST_SIGMA = 0.01  # relative; a scale known worse than that is not published
 CONTRADICTION = 1e-4  # probability with which a sound board is taken for one that contradicts its file
 
 
-class ScaleUnknown(Exception):
-    """There is no scale, and why: `reason` is "no_board", "too_few_views" or "contradiction"; the text says more."""
+class NoScaleError(Exception):
+    """There is no scale; `reason` is "no_board", "too_few_views" or "contradiction", the text says more."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -118,12 +118,14 @@ def estimate_scale(
         ellipses: ellipses of the images, by stamp.
 
     Raises:
-        ScaleUnknown: no board was seen, too few images saw it, or it contradicts its file.
+        NoScaleError: no board was seen, too few images saw it, or it contradicts its file.
     """
+    if not boards:
+        raise NoScaleError("no_board", "no board file was given: hang up a board and name its file, for metres")
     seen = {stamp: found for stamp, found in sorted(observations.items()) if found and stamp in poses}
     if not seen:
         names = ", ".join(board.name for board in boards)
-        raise ScaleUnknown("no_board", f"no board ({names}) was identified in any of {len(poses)} images with a pose")
+        raise NoScaleError("no_board", f"no board ({names}) was identified in any of {len(poses)} images with a pose")
     placed: list[_Placed] = []
     for group in layouts(boards):
         views = [_View(stamp, found) for stamp, all_found in seen.items() for found in all_found]
@@ -132,7 +134,7 @@ def estimate_scale(
         for number, place in enumerate(sorted(places, key=lambda place: place.views[0].stamp)):
             placed.append(replace(place, board=replace(group[min(number, len(group) - 1)])))
     if not placed:
-        raise ScaleUnknown(
+        raise NoScaleError(
             "too_few_views", f"a board was seen in {len(seen)} images, but from too few sides to be measured"
         )
     order = {board.name: number for number, board in enumerate(boards)}
@@ -235,7 +237,8 @@ def _consensus(
     rows = _rows(views, poses, [view.seen.centres for view in views])
     centres = np.array([-poses[view.stamp][:3, :3].T @ poses[view.stamp][:3, 3] for view in views])
     limits = np.array([_agreement(view, camera, board) for view in views])[rows.groups]
-    best, best_inliers, best_score = np.eye(4), np.zeros((len(orders), len(views)), bool), (0, 0.0)
+    best, best_score = np.eye(4), (0, 0.0)
+    best_inliers: NDArray[np.bool_] = np.zeros((len(orders), len(views)), bool)
     for first in np.unique(np.linspace(0, len(views) - 1, 40).astype(int)):
         partner = int(np.linalg.norm(centres - centres[first], axis=1).argmax())
         for order in orders:
@@ -351,7 +354,7 @@ def _adjusted(
         rows = _rows(views, poses, _pixels(views, placement, poses, camera, config))
         for _ in range(6):
             residuals, jacobian = _similarity_rows(rows, placement, board, camera)
-            residuals, jacobian, factor = _whitened(residuals, jacobian, rows.groups, centre, shift)
+            residuals, jacobian = _whitened(residuals, jacobian, rows.groups, centre, shift)
             weights = _cauchy(residuals)
             flat = (jacobian * np.sqrt(weights)[:, None, None]).reshape(-1, 7)
             change = np.linalg.lstsq(flat, -(residuals * np.sqrt(weights)[:, None]).ravel(), rcond=None)[0]
@@ -361,7 +364,7 @@ def _adjusted(
         raw, _ = _similarity_rows(rows, placement, board, camera)
         centre, shift = _components(raw, rows.groups, weights)
     residuals, jacobian = _similarity_rows(rows, placement, board, camera)
-    residuals, jacobian, factor = _whitened(residuals, jacobian, rows.groups, centre, shift)
+    residuals, jacobian = _whitened(residuals, jacobian, rows.groups, centre, shift)
     flat = (jacobian * np.sqrt(_cauchy(residuals))[:, None, None]).reshape(-1, 7)
     covariance = np.linalg.pinv(flat.T @ flat)
     return _Placed(board, tuple(views), placement, float(np.sqrt(covariance[6, 6])), centre, shift)
@@ -406,7 +409,7 @@ def _turned(placement: FloatArray, change: FloatArray, board: Board) -> FloatArr
 
 def _whitened(
     residuals: FloatArray, jacobian: FloatArray, groups: NDArray[np.intp], centre: float, shift: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray]:
     """Rows scaled to unit covariance: deviations from the image's mean by `centre`, the mean by both components."""
     count = np.bincount(groups)
     factor = centre / np.sqrt(centre**2 + count * shift**2)
@@ -417,7 +420,7 @@ def _whitened(
         np.add.at(sums, groups, flat)
         means = sums / count[:, None]
         scaled.append(((flat + ((factor - 1)[:, None] * means)[groups]) / centre).reshape(values.shape))
-    return scaled[0], scaled[1], factor
+    return scaled[0], scaled[1]
 
 
 def _cauchy(residuals: FloatArray) -> FloatArray:
@@ -448,7 +451,7 @@ def _combine(
     warnings = [text for text in faults.values() if text]
     sound = [(place, result) for place, result in measured if not faults[id(place)]]
     if not sound:
-        raise ScaleUnknown("contradiction", "; ".join(warnings))
+        raise NoScaleError("contradiction", "; ".join(warnings))
     sigmas = np.array([np.hypot(place.sigma, config.tolerance / place.board.spread) for place, _ in sound])
     logs = np.log([place.scale for place, _ in sound])
     weights = sigmas**-2 / (sigmas**-2).sum()
@@ -461,8 +464,9 @@ def _combine(
         for (place, _), log, own in zip(sound, logs, sigmas, strict=True):
             if abs(log - log_scale) > 3 * own:
                 warnings.append(
-                    f"board {place.board.name} says {100 * (np.exp(log - log_scale) - 1):+.3f} % of the common scale, "
-                    f"more than three of its sigmas ({100 * own:.3f} %): the map drifts or a board is not as its file says"
+                    f"board {place.board.name} gives a scale {100 * (np.exp(log - log_scale) - 1):+.3f} % off the "
+                    f"common one, more than three of its sigmas ({100 * own:.3f} %): the map drifts, or a board is not "
+                    "as its file says"
                 )
     first = sound[0][0]
     frame, text = _map_frame(first, float(np.exp(log_scale)), poses, config)
@@ -493,9 +497,10 @@ def _map_frame(
         origin = origin + place.placement[:3, :3] @ (2 * place.board.centres.mean(0))
         board_axes = board_axes @ turn
     elif config.upright and along[1] < abs(along[0]):
+        tilt = abs(np.rad2deg(np.arctan2(along[0], along[1])))
         text = (
-            f"board {place.board.name} hangs {abs(np.rad2deg(np.arctan2(along[0], along[1]))):.0f} degrees off upright as "
-            "the camera was held, and the map's z axis with it: hang it upright, or set upright to false"
+            f"board {place.board.name} hangs {tilt:.0f} degrees off upright as the camera was held, and the map's z "
+            "axis with it: hang it upright, or set upright to false"
         )
     frame = np.eye(4)
     frame[:3, :3] = scale * MAP_FROM_BOARD @ board_axes.T
@@ -510,7 +515,7 @@ def _measured(place: _Placed, poses: Mapping[int, FloatArray], camera: Camera, c
     residuals = np.full((len(board.centres), 3), np.nan)
     sigmas, pixels = residuals.copy(), residuals[:, 0].copy()
     noise = np.hypot(place.centre_sigma, place.shift_sigma)
-    into_board = place.placement[:3, :3].T * scale  # rotation times metres per unit, squared away below
+    to_metres = place.placement[:3, :3].T * scale**2  # its transpose is the rotation over the scale
     points = np.full((len(board.centres), 3), np.nan)
     for circle in range(len(board.centres)):
         own = rows.take(rows.circles == circle)
@@ -524,7 +529,6 @@ def _measured(place: _Placed, poses: Mapping[int, FloatArray], camera: Camera, c
             flat = (jacobian / noise * weights[..., None]).reshape(-1, 3)
             change = np.linalg.lstsq(flat, -(error * weights).ravel(), rcond=1e-9)[0]
             point = point + change
-        to_metres = into_board * scale
         covariance = np.linalg.pinv(flat.T @ flat)
         points[circle] = point
         residuals[circle] = to_metres @ (point - place.placement[:3, 3]) - board.centres[circle]
@@ -555,6 +559,6 @@ def _contradiction(place: _Placed, measured: BoardPlacement, config: BoardConfig
     offsets = 1000 * np.linalg.norm(measured.residuals_m, axis=1)
     listed = ", ".join(f"{number + 1}: {offset:.2f} mm" for number, offset in enumerate(offsets) if known[number])
     return (
-        f"board {place.board.name} contradicts its file (circles off by {listed}; expected {1000 * config.tolerance:g} mm "
-        "each): measure its centres again, or check that it is flat and the file is its own"
+        f"board {place.board.name} contradicts its file (circles off by {listed}; they should be right to "
+        f"{1000 * config.tolerance:g} mm): measure its centres again, or check that it is flat and the file is its own"
     )
