@@ -10,7 +10,8 @@ class ContourConfig:
     """Refinement by the outlines in the keyframes."""
 
     enabled: bool = field(
-        default=True, metadata={"description": "refine radius, axis and ends by the outlines in the keyframes", "unit": ""}
+        default=True,
+        metadata={"description": "refine radius, axis and ends by the outlines in the keyframes", "unit": ""},
     )
 
 
@@ -18,9 +19,21 @@ class ContourConfig:
 class DetectConfig:
     """All settings of the detector."""
 
-    seed: int = field(default=0, metadata={"description": "seed of every random choice", "unit": "", "range": (0, 2**31 - 1)})
+    seed: int = field(
+        default=0, metadata={"description": "seed of every random choice", "unit": "", "range": (0, 2**31 - 1)}
+    )
     front_end: str = field(
         default="normals",
         metadata={"description": "how cylinders are found in the cloud", "unit": "", "choices": ("normals", "planes")},
+    )
+    radius_min: float = field(
+        default=0.005, metadata={"description": "thinnest pipe looked for", "unit": "m", "range": (0.001, 1.0)}
+    )
+    length_min: float = field(
+        default=0.1, metadata={"description": "shortest pipe kept", "unit": "m", "range": (0.0, 10.0)}
+    )
+    arc_min_deg: float = field(
+        default=60.0,
+        metadata={"description": "least part of the circumference seen", "unit": "deg", "range": (10.0, 360.0)},
     )
     contour: ContourConfig = field(default_factory=ContourConfig)

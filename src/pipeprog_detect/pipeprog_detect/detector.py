@@ -1,0 +1,139 @@
+"""The detector: from a metric cloud to classified pipes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_detect import background, classify, hypotheses, normals, octree
+from pipeprog_detect.bill import Bill
+from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.octree import Octree
+from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
+from pipeprog_detect.verify import Candidate, measure
+from pipeprog_frames.errors import InputError
+
+# Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1.05 to 2.9 times as large; coarse to fine,
+# each on what the ones before have not explained.
+_SCALES = (0.16, 0.113, 0.08, 0.056, 0.04, 0.028, 0.02)
+_SITES_PER_SCALE = 1.4
+_POINTS_PER_SCALE = 7.0
+
+Report = Callable[[float, str], None]
+
+
+def detect(
+    cloud: Cloud,
+    bill: Bill,
+    config: DetectConfig,
+    views: Sequence[View] = (),
+    progress: Report | None = None,
+) -> list[Pipe]:
+    """Find, measure and classify the pipes of a metric cloud.
+
+    Points that are not finite are dropped; a cloud without any others raises InputError. `progress` is called with
+    the share done (0..1) and what is being done.
+    """
+    report = progress or _silent
+    points = np.asarray(cloud.points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"the cloud's points have the shape {points.shape}: give N x 3 metres")
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        raise InputError(f"the cloud holds no point with finite coordinates ({len(points)} in all): check its source")
+    # Far from the origin (UTM) doubles still hold micrometres, squares of them do not.
+    shift = np.round(np.median(points[finite], axis=0))
+    report(0.0, "sorting points")
+    tree = octree.build(points[finite] - shift)
+    report(0.1, "estimating noise")
+    sigma = normals.estimate_noise(tree)
+    widest = 1.5 * max(planned.outer_radius for planned in bill.classes)
+    report(0.15, "finding walls")
+    _, on_plane = background.find_planes(tree, sigma, widest)
+    tree = tree.subset(~on_plane)
+    candidates = find_candidates(tree, sigma, (config.radius_min, widest), config, report)
+    pipes = [_pipe(candidate, bill, shift) for candidate in candidates]
+    report(1.0, "done")
+    return _numbered(pipes)
+
+
+def find_candidates(
+    tree: Octree, sigma: float, radius_range: tuple[float, float], config: DetectConfig, report: Report
+) -> list[Candidate]:
+    """Accepted cylinders of the tree's points, coarse scales first, none sharing points with another."""
+    free = np.ones(len(tree.points), bool)
+    accepted: list[Candidate] = []
+    scales = [scale for scale in _SCALES if scale < radius_range[1] and 3.0 * scale > radius_range[0]]
+    for number, scale in enumerate(scales):
+        report(0.2 + 0.7 * number / len(scales), f"looking for pipes at {1e3 * scale:.0f} mm")
+        rest = tree.subset(free)
+        fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
+        sites = rest.thinned(rest.level_of(scale / _SITES_PER_SCALE))
+        shape = normals.surfaces(fine, sites, scale, sigma)
+        for initial, _ in hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range)):
+            candidate = measure(tree, free, initial, sigma)
+            if candidate is not None and is_pipe(candidate, sigma, config):
+                accepted.append(candidate)
+                free[claimed(tree, candidate, sigma)] = False
+    return accepted
+
+
+def claimed(tree: Octree, candidate: Candidate, sigma: float) -> NDArray[np.int64]:
+    """Rows of the tree that an accepted pipe explains: its surface and what lies in its barrel."""
+    margin = 4.0 * max(sigma, candidate.evidence.noise)
+    cylinder = candidate.cylinder
+    return tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + margin)
+
+
+def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig) -> bool:
+    """Whether the evidence makes a pipe of a cylinder."""
+    evidence, cylinder = candidate.evidence, candidate.cylinder
+    return (
+        cylinder.length >= max(3.0 * cylinder.radius, config.length_min)
+        and evidence.arc >= np.radians(config.arc_min_deg)
+        and evidence.coverage > 0.4
+        and evidence.inside < 0.15
+        and evidence.noise < 2.0 * sigma + 1e-3
+        and evidence.flatness > 2.0
+    )
+
+
+def _pipe(candidate: Candidate, bill: Bill, shift: FloatArray) -> Pipe:
+    cylinder = candidate.cylinder
+    sigma = candidate.fit.radius_sigma
+    name, probability = classify.classify(cylinder.radius, sigma, bill)
+    return Pipe(
+        "",
+        Cylinder(cylinder.start + shift, cylinder.end + shift, cylinder.radius),
+        sigma,
+        name,
+        probability,
+        candidate.evidence.arc,
+        candidate.evidence.noise,
+        len(candidate.rows),
+    )
+
+
+def _numbered(pipes: list[Pipe]) -> list[Pipe]:
+    """Pipes with ids p01, p02, ..., sorted by place so that the order of their discovery does not show."""
+    order = sorted(pipes, key=lambda pipe: tuple(np.round(0.5 * (pipe.cylinder.start + pipe.cylinder.end), 3)))
+    width = max(2, len(str(len(order))))
+    return [
+        Pipe(
+            f"p{number:0{width}d}",
+            pipe.cylinder,
+            pipe.radius_sigma,
+            pipe.class_name,
+            pipe.class_probability,
+            pipe.visible_arc,
+            pipe.rmse,
+            pipe.points,
+        )
+        for number, pipe in enumerate(order, start=1)
+    ]
+
+
+def _silent(share: float, what: str) -> None:
+    """No progress wanted."""

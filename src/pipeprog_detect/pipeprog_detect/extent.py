@@ -1,0 +1,93 @@
+"""Where a pipe begins and ends along its axis, and which pieces are one pipe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeprog_detect.fit import basis
+from pipeprog_detect.pipe import Cylinder, FloatArray
+
+_SECTORS = 36
+# A bin of the barrel is seen where its points cover this angle, a bin is empty under this share of its neighbours.
+_LEAST_ARC = np.radians(30.0)
+_LEAST_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Run:
+    """A stretch low..high [m] along an axis that shows the pipe's surface."""
+
+    low: float
+    high: float
+
+    @property
+    def length(self) -> float:
+        """Length [m]."""
+        return self.high - self.low
+
+
+def bin_length(radius: float, points_per_metre: float) -> float:
+    """Bins of 5 mm, or as long as it takes to hold a dozen points, at most the radius or 3 cm."""
+    return float(np.clip(12.0 / max(points_per_metre, 1.0), 0.005, max(radius, 0.03)))
+
+
+def surface_runs(points: FloatArray, cylinder: Cylinder, gap: float) -> list[Run]:
+    """Stretches of the axis along which points (N, 3), all near the surface, cover the pipe; gaps under `gap` closed.
+
+    Positions are metres from cylinder.start along its axis. Ends lie where the occupancy falls to half of the run's
+    own level, between bins by linear interpolation.
+    """
+    if len(points) < 10:
+        return []
+    offset = points - cylinder.start
+    along = offset @ cylinder.axis
+    u, v = basis(cylinder.axis)
+    sector = ((np.arctan2(offset @ v, offset @ u) + np.pi) * (_SECTORS / (2 * np.pi))).astype(int) % _SECTORS
+    size = bin_length(cylinder.radius, len(points) / max(cylinder.length, 1e-3))
+    low = float(along.min()) - size
+    place = ((along - low) / size).astype(int)
+    bins = int(place.max()) + 2
+    count = np.bincount(place, minlength=bins).astype(float)
+    grid = np.zeros((bins, _SECTORS), bool)
+    grid[place, sector] = True
+    # The arc is judged over three bins, since few points of a thin pipe fall in one.
+    arc = grid.copy()
+    arc[1:] |= grid[:-1]
+    arc[:-1] |= grid[1:]
+    needed = min(int(np.ceil(_LEAST_ARC / (2 * np.pi / _SECTORS))), 3)
+    covered = arc.sum(axis=1) >= needed
+    level = np.median(count[count > 0])
+    seen = covered & (count > _LEAST_SHARE * min(level, _local_level(count)))
+    runs: list[Run] = []
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        start, end = _ends(count, first, last, low, size)
+        if runs and start - runs[-1].high < gap:
+            runs[-1] = Run(runs[-1].low, end)
+        else:
+            runs.append(Run(start, end))
+    return runs
+
+
+def _local_level(count: FloatArray) -> float:
+    return float(np.quantile(count[count > 0], 0.25))
+
+
+def _ends(count: FloatArray, first: int, last: int, low: float, size: float) -> tuple[float, float]:
+    """Ends [m] of the run of bins first..last-1: where the counts cross half of the level beside each end."""
+    near = max(3, min(8, (last - first) // 2))
+    left = np.median(count[first : first + near])
+    right = np.median(count[max(last - near, first) : last])
+    start = first
+    while start < last - 1 and count[start] < 0.5 * left:
+        start += 1
+    end = last - 1
+    while end > start and count[end] < 0.5 * right:
+        end -= 1
+    # The outermost full bin may be filled in part, and spill over into the bin outside it.
+    lead = min(count[start] / max(left, 1e-9), 1.0) + (min(count[start - 1] / max(left, 1e-9), 0.5) if start else 0.0)
+    tail = min(count[end] / max(right, 1e-9), 1.0)
+    tail += min(count[end + 1] / max(right, 1e-9), 0.5) if end + 1 < len(count) else 0.0
+    return low + (start + 1 - lead) * size, low + (end + tail) * size

@@ -1,0 +1,185 @@
+"""Where pipes may be: sites on curved patches vote for an axis and a radius, votes on one line make a hypothesis."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pipeprog_detect import octree
+from pipeprog_detect.normals import Surfaces
+from pipeprog_detect.octree import IntArray
+from pipeprog_detect.pipe import Cylinder, FloatArray
+
+# Votes agree on an axis within this angle (local directions scatter by 2 to 5 degrees), this share of the radius
+# across it, and this ratio of radii.
+_COSINE = float(np.cos(np.radians(15.0)))
+_LATERAL = 0.3
+_RATIO = 1.3
+_LEAST_VOTES = 4
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Points on axes (V, 3) [m], axis directions (V, 3), radii (V,) [m], and the scale [m] they were seen at."""
+
+    points: FloatArray
+    directions: FloatArray
+    radii: FloatArray
+    scale: float
+
+
+def votes_of(shape: Surfaces, sigma: float, radius_range: tuple[float, float]) -> Votes:
+    """Votes of the sites whose patch is bent one way only, clearly above the noise, by a radius in the range [m].
+
+    The patch must span enough of the circle to show its bend (h / r > 0.35) and not more than it can be seen on
+    (h / r < 1).
+    """
+    bend = np.abs(shape.curvature)
+    low, high = 1.0 / radius_range[1], 1.0 / radius_range[0]
+    good = (shape.count > 0) & (bend > max(low, 0.35 / shape.scale)) & (bend < min(high, 1.0 / shape.scale))
+    good &= bend > 4.0 * shape.sigma
+    good &= np.abs(shape.second) < np.maximum(0.35 * bend, 2.0 * shape.sigma)
+    good &= (shape.rms < 2.0 * sigma + 5e-4) & (shape.inliers > 0.6)
+    centres = shape.feet[good] - shape.normals[good] / shape.curvature[good][:, None]
+    return Votes(centres, shape.directions[good], 1.0 / bend[good], shape.scale)
+
+
+def consensus(votes: Votes) -> list[tuple[Cylinder, int]]:
+    """Hypotheses, best supported first: each a cylinder through collinear votes, and how many they are.
+
+    Starts at the vote with the most alike ones around it, grows along the line while refitting it, removes its
+    votes, goes on with the rest.
+    """
+    if len(votes.points) < _LEAST_VOTES:
+        return []
+    tree = octree.build(votes.points)
+    points, directions, radii = tree.points, votes.directions[tree.order], votes.radii[tree.order]
+    around = 2.0 * votes.scale
+    level = tree.level_of(around) + 1
+    cells = tree.cells(level)
+    local = _local_support(points, directions, radii, tree.keys >> (3 * level), cells.keys, cells.starts, level, around)
+    alive = np.ones(len(points), bool)
+    found: list[tuple[Cylinder, int]] = []
+    for start in np.argsort(-local, kind="stable"):
+        if local[start] < _LEAST_VOTES:
+            break
+        if not alive[start]:
+            continue
+        centre, direction, radius = points[start], directions[start], float(radii[start])
+        reach = 3.0 * votes.scale
+        members = np.zeros(0, np.int64)
+        for _ in range(10):
+            members, along = _on_line(points, directions, radii, alive, centre, direction, radius, reach)
+            members, along = _contiguous(members, along, max(0.3, 4.0 * votes.scale))
+            if len(members) < _LEAST_VOTES:
+                break
+            radius = float(np.median(radii[members]))
+            centre = np.median(points[members], axis=0)
+            direction = _direction(points[members], directions[members], direction, radius)
+            grown = 2.0 * float(np.abs(along).max())
+            if grown <= reach and reach > 3.0 * votes.scale:
+                break
+            reach = max(1.5 * reach, grown)
+        alive[start] = False
+        if len(members) < _LEAST_VOTES:
+            continue
+        alive[members] = False
+        along = (points[members] - centre) @ direction
+        ends = centre + np.array([along.min() - votes.scale, along.max() + votes.scale])[:, None] * direction
+        found.append((Cylinder(ends[0], ends[1], radius), len(members)))
+    return sorted(found, key=lambda item: -item[1])
+
+
+def _direction(points: FloatArray, directions: FloatArray, guess: FloatArray, radius: float) -> FloatArray:
+    """Direction of a line: of its points where they reach far, of their own directions where they do not."""
+    signed = directions * np.sign(directions @ guess)[:, None]
+    mean = signed.mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    offset = points - points.mean(axis=0)
+    along = offset @ mean
+    lateral = np.linalg.norm(offset - along[:, None] * mean, axis=1)
+    # Standard deviations of both estimates: of the directions' mean, and of a line through scattered points.
+    own = np.radians(4.0) / np.sqrt(len(points))
+    line = max(float(np.median(lateral)), 0.05 * radius) / (float(np.sqrt((along**2).sum())) + 1e-12)
+    _, _, axes = np.linalg.svd(offset, full_matrices=False)
+    fitted = axes[0] * np.sign(axes[0] @ mean)
+    blend = mean / own**2 + fitted / line**2
+    return np.asarray(blend / np.linalg.norm(blend))
+
+
+def _contiguous(members: IntArray, along: FloatArray, gap: float) -> tuple[IntArray, FloatArray]:
+    """The members whose positions along the line hang together with the one at 0."""
+    if not len(members):
+        return members, along
+    order = np.argsort(along, kind="stable")
+    run = np.cumsum(np.diff(along[order], prepend=along[order[0]]) > gap)
+    here = run[int(np.argmin(np.abs(along[order])))]
+    keep = order[run == here]
+    return members[keep], along[keep]
+
+
+@njit(cache=True)
+def _agree(
+    offset: FloatArray, direction: FloatArray, other: FloatArray, radius: float, other_radius: float
+) -> tuple[bool, float]:
+    along = offset @ direction
+    if abs(direction @ other) < _COSINE:
+        return False, along
+    if radius > _RATIO * other_radius or other_radius > _RATIO * radius:
+        return False, along
+    lateral = offset @ offset - along * along
+    return lateral < (_LATERAL * radius) ** 2, along
+
+
+@njit(cache=True)
+def _local_support(
+    points: FloatArray,
+    directions: FloatArray,
+    radii: FloatArray,
+    own_cells: IntArray,
+    cell_keys: IntArray,
+    cell_starts: IntArray,
+    level: int,
+    around: float,
+) -> IntArray:
+    count = np.zeros(len(points), np.int64)
+    runs = np.zeros((27, 2), np.int64)
+    found, last = 0, -1
+    for i in range(len(points)):
+        if own_cells[i] != last:
+            last = own_cells[i]
+            found = octree.neighbour_runs(last, cell_keys, cell_starts, level, runs)
+        for r in range(found):
+            for j in range(runs[r, 0], runs[r, 1]):
+                agree, along = _agree(points[j] - points[i], directions[i], directions[j], radii[i], radii[j])
+                if agree and abs(along) < around:
+                    count[i] += 1
+    return count
+
+
+@njit(cache=True)
+def _on_line(
+    points: FloatArray,
+    directions: FloatArray,
+    radii: FloatArray,
+    alive: NDArray[np.bool_],
+    centre: FloatArray,
+    direction: FloatArray,
+    radius: float,
+    reach: float,
+) -> tuple[IntArray, FloatArray]:
+    members = np.empty(len(points), np.int64)
+    place = np.empty(len(points))
+    n = 0
+    for j in range(len(points)):
+        if not alive[j]:
+            continue
+        agree, along = _agree(points[j] - centre, direction, directions[j], radius, radii[j])
+        if agree and abs(along) < reach:
+            members[n] = j
+            place[n] = along
+            n += 1
+    return members[:n].copy(), place[:n].copy()
