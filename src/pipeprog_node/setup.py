@@ -14,6 +14,6 @@ setup(
     zip_safe=False,
     maintainer="pipeprog developers",
     maintainer_email="maintainers@pipeprog.dev",
-    description="The ROS glue that pipeprog's nodes share: settings as parameters, QoS, diagnostics, messages and main.",
+    description="The ROS glue that pipeprog's nodes share: settings as parameters, QoS, diagnostics, messages, main.",
     license="Apache-2.0",
 )

@@ -1,0 +1,247 @@
+"""Standard messages from and to NumPy arrays and pipeprog's types."""
+
+from __future__ import annotations
+
+from array import array
+
+import cv2
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from nav_msgs.msg import Path
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
+from std_msgs.msg import Header
+
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
+
+_SECOND = 1_000_000_000
+
+# Encoding -> bytes of one sample, channels, conversion to BGR or grey.
+_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
+    "mono8": (1, 1, None),
+    "8UC1": (1, 1, None),
+    "mono16": (2, 1, None),
+    "16UC1": (2, 1, None),
+    "bgr8": (1, 3, None),
+    "8UC3": (1, 3, None),
+    "rgb8": (1, 3, cv2.COLOR_RGB2BGR),
+    "bgra8": (1, 4, cv2.COLOR_BGRA2BGR),
+    "8UC4": (1, 4, cv2.COLOR_BGRA2BGR),
+    "rgba8": (1, 4, cv2.COLOR_RGBA2BGR),
+}
+_FIELD_TYPES = {
+    PointField.INT8: "i1",
+    PointField.UINT8: "u1",
+    PointField.INT16: "i2",
+    PointField.UINT16: "u2",
+    PointField.INT32: "i4",
+    PointField.UINT32: "u4",
+    PointField.FLOAT32: "f4",
+    PointField.FLOAT64: "f8",
+}
+_FIELD_CODES = {name: code for code, name in _FIELD_TYPES.items()}
+
+
+def stamp_ns(stamp: Time) -> int:
+    """Nanoseconds of a stamp."""
+    return stamp.sec * _SECOND + stamp.nanosec
+
+
+def time_msg(stamp: int) -> Time:
+    """Stamp of nanoseconds."""
+    return Time(sec=stamp // _SECOND, nanosec=stamp % _SECOND)
+
+
+def header(stamp: int, frame_id: str) -> Header:
+    """Header with a stamp in nanoseconds."""
+    return Header(stamp=time_msg(stamp), frame_id=frame_id)
+
+
+def image_from_msg(message: Image) -> NDArray[np.uint8]:
+    """(H, W) grey or (H, W, 3) BGR; raises InputError where the encoding or the size is none that can be used."""
+    if message.encoding not in _ENCODINGS:
+        raise InputError(f"images are encoded as '{message.encoding}': publish one of {', '.join(_ENCODINGS)}")
+    size, channels, conversion = _ENCODINGS[message.encoding]
+    height, width, step = message.height, message.width, message.step
+    data = np.frombuffer(message.data, np.uint8)
+    if not height or not width or step < width * channels * size or len(data) < height * step:
+        raise InputError(
+            f"damaged image: {width} x {height} {message.encoding} with rows of {step} bytes are not {len(data)} bytes"
+        )
+    rows = data[: height * step].reshape(height, step)[:, : width * channels * size]
+    if size == 2:
+        return _to_8_bits(np.ascontiguousarray(rows).view(">u2" if message.is_bigendian else "<u2"))
+    image = np.ascontiguousarray(rows) if channels == 1 else np.ascontiguousarray(rows).reshape(height, width, channels)
+    return image if conversion is None else cv2.cvtColor(image, conversion).astype(np.uint8, copy=False)
+
+
+def image_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
+    """(H, W) grey or (H, W, 3) BGR, as stored: the calibration knows nothing of an EXIF rotation.
+
+    The bytes say what they are, so `format` may say anything; raises InputError where they are damaged.
+    """
+    data = np.frombuffer(message.data, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if image is None:
+        raise InputError(f"damaged image: {data.size} bytes of format '{message.format}' are no JPEG or PNG")
+    if image.dtype != np.uint8:
+        image = _to_8_bits(image)
+    if image.ndim == 3 and image.shape[2] == 4:
+        image = image[:, :, :3]
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int = 95) -> bytes:
+    """JPEG of a (H, W) grey or (H, W, 3) BGR image."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def compressed_image(stamp: int, frame_id: str, encoded: bytes) -> CompressedImage:
+    """Message of an image's JPEG or PNG bytes."""
+    kind = "png" if encoded.startswith(b"\x89PNG") else "jpeg"
+    return CompressedImage(header=header(stamp, frame_id), format=kind, data=array("B", encoded))
+
+
+def camera_from_info(message: CameraInfo) -> Camera:
+    """The calibrated camera; raises InputError where it is not calibrated, or for a part of the sensor only."""
+    if message.binning_x > 1 or message.binning_y > 1 or message.roi.x_offset or message.roi.y_offset:
+        raise InputError(
+            f"CameraInfo has binning {message.binning_x} x {message.binning_y} and a region of interest at "
+            f"({message.roi.x_offset}, {message.roi.y_offset}): publish the calibration of the image as it is sent"
+        )
+    return Camera.from_calibration(message.width, message.height, message.k, message.distortion_model, message.d)
+
+
+def info_from_camera(camera: Camera, stamp: int, frame_id: str) -> CameraInfo:
+    """CameraInfo of an image that is neither rectified nor cropped."""
+    return CameraInfo(
+        header=header(stamp, frame_id),
+        width=camera.width,
+        height=camera.height,
+        distortion_model=camera.distortion_model,
+        d=list(camera.distortion),
+        k=camera.matrix.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.c_[camera.matrix, np.zeros(3)].ravel(),
+    )
+
+
+def path(path_header: Header, stamps: NDArray[np.int64], map_from_camera: NDArray[np.float64]) -> Path:
+    """Path of (N,) stamps and (N, 4, 4) poses of the optical frame in the header's frame."""
+    poses = []
+    for stamp, pose in zip(stamps.tolist(), map_from_camera, strict=True):
+        x, y, z = pose[:3, 3].tolist()
+        qx, qy, qz, qw = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
+        message = Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        poses.append(PoseStamped(header=header(stamp, path_header.frame_id), pose=message))
+    return Path(header=path_header, poses=poses)
+
+
+def poses_from_path(message: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(N,) stamps [ns] and (N, 4, 4) poses of a path."""
+    stamps = np.array([stamp_ns(pose.header.stamp) for pose in message.poses], np.int64)
+    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+    for pose, stamped in zip(poses, message.poses, strict=True):
+        position, orientation = stamped.pose.position, stamped.pose.orientation
+        quaternion = [orientation.x, orientation.y, orientation.z, orientation.w]
+        pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        pose[:3, 3] = position.x, position.y, position.z
+    return stamps, poses
+
+
+def point_cloud(
+    cloud_header: Header,
+    points: NDArray[np.floating],
+    colors: NDArray[np.uint8] | None = None,
+    normals: NDArray[np.floating] | None = None,
+    views: NDArray[np.integer] | None = None,
+) -> PointCloud2:
+    """Unordered cloud of (N, 3) points [m], with (N, 3) RGB colours, (N, 3) unit normals, (N,) numbers of views.
+
+    Colour is one float of the bytes 0x00RRGGBB, which RViz and PCL expect.
+    """
+    names = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    columns: dict[str, NDArray] = dict(zip("xyz", points.T, strict=True))
+    if colors is not None:
+        red, green, blue = colors.astype(np.uint32).T
+        names.append(("rgb", "<f4"))
+        columns["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+    if normals is not None:
+        names += [("normal_x", "<f4"), ("normal_y", "<f4"), ("normal_z", "<f4")]
+        columns |= dict(zip(("normal_x", "normal_y", "normal_z"), normals.T, strict=True))
+    if views is not None:
+        names.append(("views", "u1"))
+        columns["views"] = np.minimum(views, 255)
+    table = np.empty(len(points), np.dtype(names))
+    for name, column in columns.items():
+        table[name] = column
+    data = array("B")
+    data.frombytes(table.tobytes())
+    assert table.dtype.fields is not None
+    return PointCloud2(
+        header=cloud_header,
+        height=1,
+        width=len(table),
+        fields=[
+            PointField(name=name, offset=field[1], datatype=_FIELD_CODES[field[0].str[1:]], count=1)
+            for name, field in table.dtype.fields.items()
+        ],
+        is_bigendian=False,
+        point_step=table.dtype.itemsize,
+        row_step=table.dtype.itemsize * len(table),
+        data=data,
+        is_dense=bool(np.isfinite(points).all()),
+    )
+
+
+def table_from_cloud(message: PointCloud2) -> NDArray[np.void]:
+    """(N,) structured array of the cloud's fields, a view of the message; raises InputError where they do not fit."""
+    order = ">" if message.is_bigendian else "<"
+    try:
+        layout = np.dtype(
+            {
+                "names": [field.name for field in message.fields],
+                "formats": [
+                    (order + _FIELD_TYPES[field.datatype], (field.count,))
+                    if field.count > 1
+                    else order + _FIELD_TYPES[field.datatype]
+                    for field in message.fields
+                ],
+                "offsets": [field.offset for field in message.fields],
+                "itemsize": message.point_step,
+            }
+        )
+        return np.frombuffer(message.data, layout, count=message.width * message.height)
+    except (KeyError, ValueError) as error:
+        raise InputError(f"damaged point cloud: {error}") from None
+
+
+def points_from_cloud(message: PointCloud2) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """(N, 3) points [m] and (N, 3) unit normals, None where the cloud has none."""
+    table = table_from_cloud(message)
+    names = table.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(f"the point cloud has the fields {', '.join(names)}: x, y and z are needed")
+    points = _columns(table, "x", "y", "z")
+    return points, _columns(table, "normal_x", "normal_y", "normal_z") if "normal_x" in names else None
+
+
+def colors_from_cloud(message: PointCloud2) -> NDArray[np.uint8] | None:
+    """(N, 3) RGB colours, None where the cloud has none."""
+    table = table_from_cloud(message)
+    if "rgb" not in (table.dtype.names or ()):
+        return None
+    packed = np.ascontiguousarray(table["rgb"]).view(np.uint32)
+    return np.c_[packed >> 16 & 255, packed >> 8 & 255, packed & 255].astype(np.uint8)
+
+
+def _columns(table: NDArray[np.void], *names: str) -> NDArray[np.float32]:
+    return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+
+
+def _to_8_bits(image: NDArray) -> NDArray[np.uint8]:
+    """Scaled by its own maximum: sensors put 10 to 16 bits into 16, and the message does not say how many."""
+    return (image.astype(np.float32) * (255.0 / max(int(image.max()), 1)) + 0.5).astype(np.uint8)
