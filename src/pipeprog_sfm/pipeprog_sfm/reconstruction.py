@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from pipeprog_frames.camera import Camera
 from pipeprog_frames.errors import InputError
-from pipeprog_sfm.board import Board, BoardTracker
+from pipeprog_sfm.board import Board
+from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.fusion import FusedCloud, Fusion
 from pipeprog_sfm.mapper import FrameTie, KeyframeReport, Mapper
