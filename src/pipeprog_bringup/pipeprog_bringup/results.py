@@ -17,6 +17,7 @@ import yaml
 from numpy.typing import NDArray
 
 from pipeprog_camera.errors import InputError
+from pipeprog_detect.classify import ClassProgress
 from pipeprog_detect.pipe import Pipe
 
 FloatArray = NDArray[np.float64]
@@ -31,22 +32,6 @@ class Scale:
 
     source: str
     sigma: float | None
-
-
-@dataclass(frozen=True)
-class ClassProgress:
-    """One class of the bill: outer radius [m], planned and installed length [m], colour (r, g, b) in [0, 1]."""
-
-    name: str
-    outer_radius: float
-    planned: float
-    installed: float
-    color: tuple[float, float, float]
-
-    @property
-    def percent(self) -> float | None:
-        """Installed share of what is planned [%]; None where nothing is planned."""
-        return 100 * self.installed / self.planned if self.planned > 0 else None
 
 
 @dataclass(frozen=True)
@@ -75,7 +60,7 @@ def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgre
                 "outer_radius": round(entry.outer_radius, 6),
                 "planned_m": round(entry.planned, 6),
                 "installed_m": round(entry.installed, 6),
-                "percent": None if entry.percent is None else round(entry.percent, 2),
+                "percent": round(entry.percent, 2),
             }
             for entry in classes
         ],
@@ -90,9 +75,8 @@ def write_progress(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassPro
         writer.writerow(["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes"])
         for entry in classes:
             count = sum(pipe.class_name == entry.name for pipe in pipes)
-            percent = "" if entry.percent is None else f"{entry.percent:.1f}"
-            row = [entry.name, f"{1e3 * entry.outer_radius:.2f}", f"{entry.planned:.3f}", f"{entry.installed:.3f}"]
-            writer.writerow([*row, percent, count])
+            lengths = [f"{entry.planned:.3f}", f"{entry.installed:.3f}", f"{entry.percent:.1f}"]
+            writer.writerow([entry.name, f"{1e3 * entry.outer_radius:.2f}", *lengths, count])
 
 
 def write_trajectory(path: Path, stamps: Sequence[int], translations: FloatArray, quaternions: FloatArray) -> None:

@@ -8,6 +8,11 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
+
+from pipeprog_bringup import cdr
+from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.bag_writer import BagWriter, message_definition
+from pipeprog_camera.errors import InputError
 from tests.unit.bringup.recordings import (
     CAMERA,
     START,
@@ -19,11 +24,6 @@ from tests.unit.bringup.recordings import (
     raw_image,
     write_bag,
 )
-
-from pipeprog_bringup import cdr
-from pipeprog_bringup.bag import Bag
-from pipeprog_bringup.bag_writer import BagWriter, message_definition
-from pipeprog_camera.errors import InputError
 
 IMAGES = [image(number) for number in range(8)]
 LAYOUTS = {

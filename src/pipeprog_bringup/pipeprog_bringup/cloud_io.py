@@ -1,0 +1,196 @@
+"""Point clouds from files, and to them: PLY, PCD, LAS/LAZ and text, in metres."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.pipe import Cloud
+
+FloatArray = NDArray[np.float64]
+
+# Further out than a site extends, coordinates belong to a map grid; working near the origin keeps squares of
+# coordinates within double precision (1e6 m squared leaves 0.1 mm).
+FAR = 10_000.0
+# Coarser coordinates than this cannot hold a pipe of 8.6 mm radius.
+RESOLUTION = 0.005
+_NORMALS = ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class CloudFile:
+    """A cloud about `origin` (3,) [m], whole numbers; `dropped` points of the file were not finite."""
+
+    cloud: Cloud
+    origin: FloatArray
+    dropped: int
+
+
+def read_cloud(path: Path) -> CloudFile:
+    """Read .ply, .pcd, .las, .laz, .xyz, .txt, .csv or .pts; raises InputError where there is no usable cloud in it."""
+    if not path.is_file():
+        raise InputError(f"no such cloud: {path}")
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: '{path.suffix}' is no cloud format: use one of {', '.join(_READERS)}")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path} is empty (0 bytes): export the cloud again")
+    try:
+        columns = reader(path)
+    except InputError:
+        raise
+    except MemoryError:
+        raise InputError(f"{path} does not fit into memory: thin it out first") from None
+    # The parsers are other people's and raise whatever their damaged input leads to.
+    except Exception as error:
+        raise InputError(f"{path} cannot be read as {path.suffix}: {error or type(error).__name__}") from None
+    return _cloud_file(path, columns)
+
+
+def write_ply(
+    path: Path,
+    points: NDArray[np.floating],
+    colors: NDArray[np.uint8] | None = None,
+    normals: NDArray[np.floating] | None = None,
+) -> None:
+    """Binary PLY of points (N, 3) [m] as float32, with colours (N, 3) and normals (N, 3) where they are given."""
+    columns: list[tuple[str, str, NDArray]] = [(axis, "<f4", points[:, i]) for i, axis in enumerate("xyz")]
+    if normals is not None:
+        columns += [(name, "<f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
+    if colors is not None:
+        columns += [(name, "u1", colors[:, i]) for i, name in enumerate(("red", "green", "blue"))]
+    vertices = np.empty(len(points), [(name, kind) for name, kind, _ in columns])
+    for name, _, values in columns:
+        vertices[name] = values
+    properties = [f"property {'uchar' if kind == 'u1' else 'float'} {name}" for name, kind, _ in columns]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header"]
+    with path.open("wb") as stream:
+        stream.write("\n".join(header).encode() + b"\n")
+        vertices.tofile(stream)
+
+
+def _cloud_file(path: Path, columns: dict[str, NDArray]) -> CloudFile:
+    missing = [axis for axis in "xyz" if axis not in columns]
+    if missing:
+        raise InputError(f"{path} has no column {', '.join(missing)}: it has {', '.join(columns) or 'none'}")
+    points = np.stack([np.asarray(columns[axis], float) for axis in "xyz"], axis=1)
+    finite = np.isfinite(points).all(axis=1)
+    dropped = len(points) - int(finite.sum())
+    if dropped == len(points):
+        what = "no points" if not len(points) else f"{dropped} points and none is finite"
+        raise InputError(f"{path} holds {what}: export the cloud again")
+    if dropped:
+        points = points[finite]
+    extent = float(np.abs(points).max())
+    if all(columns[axis].dtype == np.float32 for axis in "xyz") and np.spacing(np.float32(extent)) > RESOLUTION:
+        step = 1e3 * float(np.spacing(np.float32(extent)))
+        raise InputError(
+            f"{path}: coordinates of {extent:.0f} m in 32-bit floats are {step:.0f} mm apart: "
+            "export it with a local origin, in double precision or as LAS"
+        )
+    if (points == np.round(points)).all():
+        raise InputError(
+            f"{path}: every coordinate is a whole number, and metres in whole numbers hold no pipe: "
+            "export it in metres with decimals (millimetres: divide by 1000)"
+        )
+    origin = np.zeros(3)
+    if extent > FAR:
+        origin = np.round(np.median(points, axis=0))
+        points -= origin
+    return CloudFile(Cloud(points, _normals(columns, finite)), origin, dropped)
+
+
+def _normals(columns: dict[str, NDArray], finite: NDArray[np.bool_]) -> FloatArray | None:
+    """Unit normals, or None where the file has none for every point."""
+    names = next((names for names in _NORMALS if all(name in columns for name in names)), None)
+    if names is None:
+        return None
+    normals = np.stack([np.asarray(columns[name], float)[finite] for name in names], axis=1)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    if not (np.isfinite(lengths) & (lengths > 1e-6)).all():
+        return None
+    return normals / lengths
+
+
+def _structured(data: NDArray) -> dict[str, NDArray]:
+    return {name.lower(): data[name] for name in data.dtype.names or ()}
+
+
+def _read_ply(path: Path) -> dict[str, NDArray]:
+    from plyfile import PlyData
+
+    elements = PlyData.read(str(path))
+    if "vertex" not in elements:
+        raise InputError(f"{path} holds no vertices")
+    return _structured(elements["vertex"].data)
+
+
+def _read_pcd(path: Path) -> dict[str, NDArray]:
+    from pypcd4 import PointCloud
+
+    return _structured(PointCloud.from_path(path).pc_data)
+
+
+def _read_las(path: Path) -> dict[str, NDArray]:
+    import laspy
+
+    with laspy.open(path) as file:
+        las = file.read()
+    columns = {axis: np.asarray(getattr(las, axis), float) for axis in "xyz"}
+    names = {name.lower(): name for name in las.point_format.extra_dimension_names}
+    return columns | {name: np.asarray(las[names[name]]) for group in _NORMALS for name in group if name in names}
+
+
+def _read_text(path: Path) -> dict[str, NDArray]:
+    """Columns of numbers (blanks, commas or semicolons between them), x y z first unless a line of names differs."""
+    names, skipped, separator = ["x", "y", "z"], 0, None
+    with path.open(encoding="utf-8", errors="replace") as stream:
+        for line in itertools.islice(stream, 100):
+            text = line.strip().lstrip("#/").strip()
+            separator = next((mark for mark in (";", ",") if mark in text), None)
+            cells = [cell.strip() for cell in text.split(separator)] if text else []
+            if len(cells) >= 3 and _numeric(cells[:3]) and not line.strip().startswith(("#", "/")):
+                break
+            # A line of fewer numbers is the count that opens a .pts file.
+            if {"x", "y", "z"} <= {cell.lower().strip('"') for cell in cells}:
+                names = [cell.lower().strip('"') for cell in cells]
+            skipped += 1
+        else:
+            raise InputError(f"{path}: no line of three numbers among the first {skipped}: it is no list of points")
+    names = names[: len(cells)]
+    wanted = [name for name in names if name in ("x", "y", "z", *itertools.chain(*_NORMALS))]
+    table = np.loadtxt(
+        path,
+        delimiter=separator,
+        comments=["#", "//"],
+        skiprows=skipped,
+        usecols=[names.index(name) for name in wanted],
+        ndmin=2,
+        encoding="utf-8",
+    )
+    return {name: table[:, i] for i, name in enumerate(wanted)}
+
+
+def _numeric(cells: list[str]) -> bool:
+    try:
+        return bool([float(cell) for cell in cells])
+    except ValueError:
+        return False
+
+
+_READERS: dict[str, Callable[[Path], dict[str, NDArray]]] = {
+    ".ply": _read_ply,
+    ".pcd": _read_pcd,
+    ".las": _read_las,
+    ".laz": _read_las,
+    ".xyz": _read_text,
+    ".txt": _read_text,
+    ".csv": _read_text,
+    ".pts": _read_text,
+}
