@@ -7,11 +7,9 @@ from numba import njit
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import qmc
 
+from pipeprog_detect.edges import WINDOW_OF_HALF_WIDTH
 from pipeprog_detect.outline import Stations
 from pipeprog_detect.pipe import FloatArray
-
-# A line belongs to one side of the pipe only while it is nearer to it than to the axis.
-WINDOW_OF_HALF_WIDTH = 0.8
 
 
 def responses(values: FloatArray, offsets: FloatArray, at: Stations) -> FloatArray:

@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.consensus import WINDOW_OF_HALF_WIDTH, responses, search
-from pipeprog_detect.edges import LimbEdges, limb_edges, profiles
-from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, visible
+from pipeprog_detect.consensus import responses, search
+from pipeprog_detect.edges import WINDOW_OF_HALF_WIDTH, LimbEdges, outline_edges, profiles, sideways
+from pipeprog_detect.outline import Stations, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
+from pipeprog_detect.rim import End, find_end
+from pipeprog_detect.support import hits, support_profile
 
 # Pixels of outline that make one measurement: the mean over them tames texture, the line stays straight within.
 CHUNK = 12
-# The limb model's window: inwards as far as shading stays smooth, outwards to where the next thing may begin [px].
-INWARD, OUTWARD = 8.0, 3.0
-# Blur of an unresized camera image, lens and pixel together [px]; the model's offset hardly depends on it.
-BLUR = 0.5
 # Scale of the robust loss [px] and of the unresolved error of one edge within a blur of its place [px].
 ROBUST, FLOOR = 0.3, 0.1
 # A tenth of the blur remains as the limb model's own error, common to all views [px].
 MODEL_ERROR = 0.05
+# Cylinders that are not there stay under 0.1 (see `support`).
+MIN_SUPPORT = 0.25
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,9 @@ class ContourFit:
     """A cylinder measured by its outlines.
 
     `covariance` (5, 5) of the axis' offset at its middle (2) [m], its direction (2) [rad] and the radius [m], the
-    directions being those of `basis` (2, 3); `support` share of the outline with an edge in three views or more.
+    directions being those of `basis` (2, 3); `support` share of the outline with an edge in three views or more;
+    `views` number of views used; `start_sigma`, `end_sigma` [m], NaN where the images do not show that end and the
+    given one stands.
     """
 
     cylinder: Cylinder
@@ -54,21 +56,36 @@ def refine(
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little.
 
+    `initial_radius_sigma` [m] is the standard deviation of the given radius; that of the axis is taken as twice as
+    much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote.
+
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
-    moves; then robust least squares on limb-aware sub-pixel edges. `planned_radii` only seed the vote.
+    moves; then robust least squares on limb-aware sub-pixel edges. The ends follow from the rims (`rim.find_end`).
     """
-    basis = frame(cylinder, _viewing_direction(cylinder, views))
-    coarse = _vote(cylinder, initial_radius_sigma, views, others, basis, planned_radii)
-    if coarse is None:
+    if not views:
         return None
-    return _fit(coarse, views, others, basis)
-
-
-def _viewing_direction(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
-    middle = 0.5 * (cylinder.start + cylinder.end)
-    directions = [middle - camera_centre(view) for view in views]
-    return np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
+    basis = frame(cylinder, viewing_direction(cylinder, views))
+    step = _vote(cylinder, initial_radius_sigma, views, others, basis, planned_radii)
+    if step is None:
+        return None
+    view_offset = np.zeros(len(views))
+    prior = np.zeros(5)
+    prior[:4] = 1.0 / (2.0 * initial_radius_sigma) ** 2
+    for reach in (2.5, 1.5, 1.2, 1.2):
+        current = moved(cylinder, basis, step)
+        at, edges = outline_edges(current, views, others, basis, view_offset, reach, CHUNK)
+        if len(at) < 20:
+            return None
+        solution = _solve(at, edges, len(views), prior, step)
+        step = step + solution.step
+        view_offset = solution.view_offset
+    refined = moved(cylinder, basis, step)
+    share = support_profile(at, hits(at, _moved_by(edges, at, solution), view_offset)).share
+    if share < MIN_SUPPORT or refined.radius <= 0:
+        return None
+    ends = [find_end(refined, at_end, views, others, basis, view_offset) for at_end in (False, True)]
+    return _result(refined, solution, share, basis, at, ends)
 
 
 def _vote(
@@ -78,7 +95,8 @@ def _vote(
     others: Sequence[Cylinder],
     basis: FloatArray,
     planned_radii: Sequence[float],
-) -> Cylinder | None:
+) -> FloatArray | None:
+    """The step (5,) of `outline.moved` that most edges of all views support."""
     at = stations(cylinder, views, basis, CHUNK)
     at = at.select(visible(cylinder, others, views, at))
     if len(np.unique(at.view)) < 2 or len(np.unique(at.side)) < 2:
@@ -86,92 +104,50 @@ def _vote(
     at = at.select(np.arange(0, len(at), max(len(at) // 1500, 1)))
     pixel = 1.0 / float(np.median(at.gain))
     radius = cylinder.radius
-    sideways = float(np.clip(3.0 * sigma, 2.0 * pixel, 0.4 * radius))
+    aside = float(np.clip(3.0 * sigma, 2.0 * pixel, 0.4 * radius))
     thicker = float(np.clip(2.5 * sigma, 2.0 * pixel, 0.3 * radius))
-    reach = np.array([sideways, sideways, sideways, sideways, thicker])
-    furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, (sideways + thicker) * float(at.gain.max()))
-    step = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))
-    offsets = np.arange(-np.ceil(furthest / step) - 2, np.ceil(furthest / step) + 3) * step
+    reach = np.array([aside, aside, aside, aside, thicker])
+    furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, (aside + thicker) * float(at.gain.max()))
+    spacing = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))
+    offsets = np.arange(-np.ceil(furthest / spacing) - 2, np.ceil(furthest / spacing) + 3) * spacing
     response = responses(profiles(views, at, offsets, CHUNK // 2), offsets, at)
     near = [value - radius for value in planned_radii if abs(value - radius) < thicker]
     seeds = np.zeros((len(near), 5))
     seeds[:, 4] = near
-    random = np.random.default_rng(0)
-    best, _ = search(at, response, offsets, reach, seeds, random)
-    return moved(cylinder, basis, best[0])
+    best, _ = search(at, response, offsets, reach, seeds, np.random.default_rng(0))
+    return best[0]
 
 
 @dataclass(frozen=True)
 class _Solution:
+    """A step (5,) with its covariance (5, 5), the sideways offset (V,) of each view [px] and which stations spoke."""
+
     step: FloatArray
     covariance: FloatArray
     view_offset: FloatArray
     used: NDArray[np.bool_]
 
 
-def _fit(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], basis: FloatArray) -> ContourFit | None:
-    view_offset = np.zeros(len(views))
-    for reach in (2.5, 1.5, 1.2, 1.2):
-        at, edges = measure(cylinder, views, others, basis, view_offset, reach)
-        if len(at) < 20:
-            return None
-        solution = _solve(at, edges, len(views))
-        cylinder = moved(cylinder, basis, solution.step)
-        view_offset = solution.view_offset
-    length = cylinder.length
-    mean = np.zeros((5, 5))
-    mean[0:2, 0:2] = mean[0:2, 2:4] = 0.5 * np.eye(2)
-    mean[2:4, 0:2] = -np.eye(2) / length
-    mean[2:4, 2:4] = np.eye(2) / length
-    mean[4, 4] = 1.0
-    covariance = mean @ solution.covariance @ mean.T
-    return ContourFit(
-        cylinder,
-        covariance,
-        basis,
-        float(np.sqrt(covariance[4, 4])),
-        0.0,
-        len(np.unique(at.view[solution.used])),
-        float("nan"),
-        float("nan"),
-    )
-
-
-def measure(
-    cylinder: Cylinder,
-    views: Sequence[View],
-    others: Sequence[Cylinder],
-    basis: FloatArray,
-    view_offset: FloatArray,
-    reach: float,
-) -> tuple[Stations, LimbEdges]:
-    """Stations on the outlines and the edges within `reach` px of them."""
-    at = stations(cylinder, views, basis, CHUNK, margin=INWARD)
-    at = at.select(visible(cylinder, others, views, at))
-    if not len(at):
-        return at, LimbEdges(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
-    inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(at.half_width)))
-    offsets = np.arange(-inward - reach, OUTWARD + 0.25, 0.5)
-    values = profiles(views, at, offsets, CHUNK)
-    return at, limb_edges(values, offsets, at.half_width, BLUR, reach)
-
-
-def _solve(at: Stations, edges: LimbEdges, count: int) -> _Solution:
+def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far: FloatArray) -> _Solution:
     """Robust least squares for the step (5,) with a sideways offset of each view as a random effect.
 
     A wrong pose moves both outlines of a view together, which says nothing about the radius: the offsets' variance is
-    estimated from the views' scatter (expectation maximisation), so that with true poses they vanish.
+    estimated from the views' scatter (expectation maximisation), so that with true poses they vanish. `prior` (5,) is
+    the precision [1/m^2] of the start, from which `so_far` (5,) has led: where the views lie in a row along the pipe,
+    only the cloud knows its distance.
+
+    The covariance clusters the residuals by view (sandwich estimator): edges along one line share their errors.
     """
     jacobian = at.jacobian
-    sign = np.where(at.side == 0, 1.0, -1.0)
+    sign = sideways(at)
     step = np.zeros(5)
     offset = np.zeros(count)
     variance = 0.25
+    rows = np.arange(len(at))
     for _ in range(25):
         predicted = jacobian @ step + sign * offset[at.view]
         distance = np.where(np.isfinite(edges.offset), np.abs(edges.offset - predicted[:, None]), np.inf)
         nearest = np.argmin(distance, axis=1)
-        rows = np.arange(len(at))
         used = np.isfinite(distance[rows, nearest]) & (edges.sigma[rows, nearest] < 0.7)
         seen = np.where(used, edges.offset[rows, nearest], 0.0)
         sigma = np.where(used, edges.sigma[rows, nearest], 1.0)
@@ -181,9 +157,9 @@ def _solve(at: Stations, edges: LimbEdges, count: int) -> _Solution:
         own = np.bincount(at.view, weight, count) + 1.0 / variance
         cross = np.stack([np.bincount(at.view, sign * weighted[:, k], count) for k in range(5)], axis=1)
         right = np.bincount(at.view, sign * weight * seen, count)
-        normal = weighted.T @ jacobian - (cross / own[:, None]).T @ cross
+        normal = weighted.T @ jacobian - (cross / own[:, None]).T @ cross + np.diag(prior)
         normal += np.diag(np.full(5, 1e-9 * np.trace(normal)))
-        step = np.linalg.solve(normal, weighted.T @ seen - cross.T @ (right / own))
+        step = np.linalg.solve(normal, weighted.T @ seen - cross.T @ (right / own) - prior * so_far)
         offset = (right - cross @ step) / own
         active = own > 2.0 / variance
         if active.any():
@@ -193,6 +169,43 @@ def _solve(at: Stations, edges: LimbEdges, count: int) -> _Solution:
     clusters = len(np.unique(at.view[used]))
     inverse = np.linalg.inv(normal)
     covariance = inverse @ (scores.T @ scores) @ inverse * clusters / max(clusters - 3, 1) + inverse
-    model = (MODEL_ERROR / float(np.median(at.gain))) ** 2
-    covariance = covariance + model * np.eye(5)
+    covariance = covariance + (MODEL_ERROR / float(np.median(at.gain))) ** 2 * np.eye(5)
     return _Solution(step, covariance, offset, used)
+
+
+def _moved_by(edges: LimbEdges, at: Stations, solution: _Solution) -> LimbEdges:
+    """The edges as offsets from the solution's outline."""
+    return LimbEdges(edges.offset - (at.jacobian @ solution.step)[:, None], edges.sigma, edges.explained)
+
+
+def _result(
+    cylinder: Cylinder,
+    solution: _Solution,
+    share: float,
+    basis: FloatArray,
+    at: Stations,
+    ends: Sequence[End | None],
+) -> ContourFit:
+    length, axis = cylinder.length, cylinder.axis
+    from_ends = np.zeros((5, 5))
+    from_ends[0:2, 0:2] = from_ends[0:2, 2:4] = 0.5 * np.eye(2)
+    from_ends[2:4, 0:2] = -np.eye(2) / length
+    from_ends[2:4, 2:4] = np.eye(2) / length
+    from_ends[4, 4] = 1.0
+    covariance = from_ends @ solution.covariance @ from_ends.T
+    start, end = ends
+    measured = Cylinder(
+        cylinder.start - (start.position if start else 0.0) * axis,
+        cylinder.end + (end.position if end else 0.0) * axis,
+        cylinder.radius,
+    )
+    return ContourFit(
+        measured,
+        covariance,
+        basis,
+        float(np.sqrt(covariance[4, 4])),
+        share,
+        len(np.unique(at.view[solution.used])),
+        start.sigma if start else float("nan"),
+        end.sigma if end else float("nan"),
+    )

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from pipeprog_detect.outline import Stations
-from pipeprog_detect.pipe import FloatArray, View
+from pipeprog_detect.outline import Stations, stations, visible
+from pipeprog_detect.pipe import Cylinder, FloatArray, View
+
+# The limb model's window: inwards as far as shading stays smooth, outwards to where the next thing may begin [px].
+INWARD, OUTWARD = 8.0, 3.0
+# A line belongs to one side of the pipe only while it is nearer to it than to the axis.
+WINDOW_OF_HALF_WIDTH = 0.8
+# Blur of an unresized camera image, lens and pixel together [px]; the model's offset hardly depends on it.
+BLUR = 0.5
 
 
 def _linear_light() -> FloatArray:
@@ -73,7 +80,8 @@ def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
     depth = np.clip(-grid, 0.0, half_width) / half_width
     towards = np.sqrt(depth * (2.0 - depth))
     columns = np.stack([1.0 - inside, (1.0 - inside) * grid / 4.0, inside, inside * depth * half_width / 4.0, towards])
-    taps = np.arange(-reach, reach + 0.5 * fine, fine)
+    half = int(np.ceil(reach / fine))
+    taps = np.arange(-half, half + 1) * fine
     kernel = np.exp(-0.5 * (taps / blur) ** 2)
     kernel /= kernel.sum()
     blurred = [np.convolve(np.pad(column, len(kernel) // 2, mode="edge"), kernel, mode="valid") for column in columns]
@@ -135,3 +143,34 @@ def _minima(cost: FloatArray, plain: FloatArray, trials: FloatArray, places: int
     sigma = np.where(found, step * np.sqrt(2.0 * variance / curvature), np.inf)
     explained = np.where(found, np.clip(1.0 - at / plain[:, None], 0.0, 1.0), 0.0)
     return LimbEdges(offset, sigma, explained)
+
+
+def sideways(at: Stations) -> FloatArray:
+    """Sign (N,) of the outward displacement that a shift of the whole pipe towards side 0 causes."""
+    return np.where(at.side == 0, 1.0, -1.0)
+
+
+def outline_edges(
+    cylinder: Cylinder,
+    views: Sequence[View],
+    others: Sequence[Cylinder],
+    basis: FloatArray,
+    view_offset: FloatArray,
+    reach: float,
+    chunk: int,
+) -> tuple[Stations, LimbEdges]:
+    """Stations every `chunk` px on the predicted outlines and the edges near them.
+
+    Each profile is the mean over its chunk; edges lie within `reach` px of where the sideways `view_offset` (V,) px of
+    each view puts the outline. Stations behind one of the `others` are left out.
+    """
+    at = stations(cylinder, views, basis, chunk, margin=INWARD)
+    at = at.select(visible(cylinder, others, views, at))
+    if not len(at):
+        return at, LimbEdges(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+    inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(at.half_width)))
+    offsets = np.arange(-inward - reach, OUTWARD + 0.25, 0.5)
+    shift = sideways(at) * view_offset[at.view]
+    values = profiles(views, replace(at, pixel=at.pixel + shift[:, None] * at.normal), offsets, chunk)
+    edges = limb_edges(values, offsets, at.half_width, BLUR, reach)
+    return at, replace(edges, offset=edges.offset + shift[:, None])

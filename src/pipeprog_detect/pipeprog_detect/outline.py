@@ -78,6 +78,13 @@ def frame(cylinder: Cylinder, towards: FloatArray) -> FloatArray:
     return np.stack([np.cross(axis, depth), depth])
 
 
+def viewing_direction(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
+    """Mean unit vector (3,) from the cameras to the cylinder's middle."""
+    middle = 0.5 * (cylinder.start + cylinder.end)
+    directions = [middle - camera_centre(view) for view in views]
+    return np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
+
+
 def moved(cylinder: Cylinder, basis: FloatArray, step: FloatArray) -> Cylinder:
     """The cylinder after a step (5,): offsets of its start (2) and end (2) along `basis` and of its radius [m]."""
     return Cylinder(

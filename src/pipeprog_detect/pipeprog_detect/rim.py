@@ -1,0 +1,139 @@
+"""The ends of a pipe in the keyframes: the rim, seen on the unrolled barrel, where the outlines stop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from pipeprog_detect.edges import LINEAR_LIGHT, outline_edges
+from pipeprog_detect.outline import camera_centre, project
+from pipeprog_detect.pipe import Cylinder, FloatArray, View
+from pipeprog_detect.support import hits, support_profile
+
+# The barrel's part that faces the camera steeply enough to resolve lengths on it.
+HALF_ARC, SECTORS, RAYS_PER_SECTOR = np.radians(70.0), 6, 4
+# Samples for one pixel along the axis.
+SAMPLES_PER_PIXEL = 2
+# The outlines must stop: their support falls by this much from inside the end to outside.
+MIN_CONTRAST = 0.3
+
+
+@dataclass(frozen=True)
+class End:
+    """Where a pipe ends: `position` outwards from the given end and its standard deviation [m]."""
+
+    position: float
+    sigma: float
+
+
+def find_end(
+    cylinder: Cylinder,
+    at_end: bool,
+    views: Sequence[View],
+    others: Sequence[Cylinder],
+    basis: FloatArray,
+    view_offset: FloatArray,
+) -> End | None:
+    """The end of the straight barrel near the given one, or None where the images do not tell.
+
+    The end is where the support of the outlines falls and where, on the barrel unrolled from each view by the known
+    axis and radius, an edge lies across the axis at one position for all directions and views. The circle of the rim
+    needs no conic that way: its projection is the unrolling itself.
+    """
+    axis = cylinder.axis if at_end else -cylinder.axis
+    end = cylinder.end if at_end else cylinder.start
+    outside = max(0.15, 3.0 * cylinder.radius)
+    inside = min(outside, 0.6 * cylinder.length)
+    distances = [np.linalg.norm(end - camera_centre(view)) for view in views]
+    pixel = float(np.median(distances)) / views[0].camera.fx
+    position, contrast = _contrast(cylinder, axis, end, inside, outside, pixel, views, others, basis, view_offset)
+    if not len(position) or contrast.max() < MIN_CONTRAST:
+        return None
+    along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL)
+    slopes = [_slopes(axis, end, cylinder.radius, along, view) for view in views]
+    edges = np.concatenate(slopes) if slopes else np.zeros((0, len(along)))
+    seen = np.isfinite(edges)
+    if not seen.any():
+        return None
+    typical = float(np.median(np.abs(edges[seen])))
+    strength = np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0)
+    count = seen.sum(axis=0)
+    vote = np.where(count >= 2 * SECTORS, strength.sum(axis=0) / np.maximum(count, 1), 0.0)
+    score = np.interp(along, position, contrast, left=-1.0, right=-1.0) + vote
+    best = int(np.argmax(score))
+    if np.interp(along[best], position, contrast) < MIN_CONTRAST:
+        return None
+    return _refined(strength, seen, along, best, pixel)
+
+
+def _contrast(
+    cylinder: Cylinder,
+    axis: FloatArray,
+    end: FloatArray,
+    inside: float,
+    outside: float,
+    pixel: float,
+    views: Sequence[View],
+    others: Sequence[Cylinder],
+    basis: FloatArray,
+    view_offset: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Positions along `axis` from `end` and how much the support of the outlines falls there."""
+    stretch = Cylinder(end - inside * axis, end + outside * axis, cylinder.radius)
+    at, edges = outline_edges(stretch, views, others, basis, view_offset, 1.5, 6)
+    if not len(at):
+        return np.zeros(0), np.zeros(0)
+    profile = support_profile(at, hits(at, edges, view_offset))
+    position = profile.along + 0.5 * (outside - inside)
+    seen, found = profile.seen.sum(axis=1), profile.hits.sum(axis=1)
+    window = max(cylinder.radius, 30.0 * pixel)
+    fall = np.full(len(position), -1.0)
+    for index, here in enumerate(position):
+        before = (position > here - window) & (position <= here)
+        after = (position > here) & (position <= here + window)
+        if seen[before].sum() >= 12 and seen[after].sum() >= 12:
+            fall[index] = found[before].sum() / seen[before].sum() - found[after].sum() / seen[after].sum()
+    return position, fall
+
+
+def _slopes(axis: FloatArray, end: FloatArray, radius: float, along: FloatArray, view: View) -> FloatArray:
+    """Derivative of the light along the axis (SECTORS, T) on the unrolled barrel; NaN outside the image."""
+    towards = camera_centre(view) - end
+    towards = towards - axis * (axis @ towards)
+    towards = towards / np.linalg.norm(towards)
+    angle = np.linspace(-HALF_ARC, HALF_ARC, SECTORS * RAYS_PER_SECTOR)
+    radial = np.cos(angle)[:, None] * towards + np.sin(angle)[:, None] * np.cross(axis, towards)
+    points = end + along[None, :, None] * axis + radius * radial[:, None]
+    pixel, depth = project(view, points.reshape(-1, 3))
+    camera = view.camera
+    inside = (depth > 0.05) & (pixel > 2).all(axis=1)
+    inside &= (pixel[:, 0] < camera.width - 3) & (pixel[:, 1] < camera.height - 3)
+    inside = inside.reshape(SECTORS, RAYS_PER_SECTOR, -1).all(axis=1)
+    where = pixel.astype(np.float32).reshape(len(angle), len(along), 2)
+    light = cv2.LUT(view.image, LINEAR_LIGHT)
+    light = cv2.remap(light, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    mean = light.reshape(SECTORS, RAYS_PER_SECTOR, -1).mean(axis=1, dtype=float)
+    return np.where(inside, gaussian_filter1d(mean, SAMPLES_PER_PIXEL, axis=1, order=1), np.nan)
+
+
+def _refined(strength: FloatArray, seen: FloatArray, along: FloatArray, best: int, pixel: float) -> End:
+    """The peak near sample `best` of each view, their median and its deviation."""
+    reach = 3 * SAMPLES_PER_PIXEL
+    low, high = max(best - reach, 1), min(best + reach + 1, len(along) - 1)
+    per_view = strength.reshape(-1, SECTORS, len(along)).sum(axis=1)
+    whole = seen.reshape(-1, SECTORS, len(along))[:, :, low - 1 : high + 1].all(axis=2).sum(axis=1) >= SECTORS // 2
+    places = []
+    for row in per_view[whole]:
+        peak = low + int(np.argmax(row[low:high]))
+        bend = row[peak - 1] - 2.0 * row[peak] + row[peak + 1]
+        shift = 0.5 * (row[peak - 1] - row[peak + 1]) / bend if bend < 0 else 0.0
+        places.append(along[peak] + np.clip(shift, -0.5, 0.5) * (along[1] - along[0]))
+    if not places:
+        return End(float(along[best]), 2.0 * pixel)
+    position = float(np.median(places))
+    scatter = 1.4826 * float(np.median(np.abs(np.array(places) - position)))
+    return End(position, float(np.hypot(1.25 * scatter / np.sqrt(len(places)), 0.5 * pixel)))
