@@ -15,9 +15,6 @@ from pipeprog_detect.pipe import Cloud
 
 FloatArray = NDArray[np.float64]
 
-# Further out than a site extends, coordinates belong to a map grid; working near the origin keeps squares of
-# coordinates within double precision (1e6 m squared leaves 0.1 mm).
-FAR = 10_000.0
 # Coarser coordinates than this cannot hold a pipe of 8.6 mm radius.
 RESOLUTION = 0.005
 _NORMALS = ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz")
@@ -25,10 +22,9 @@ _NORMALS = ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz")
 
 @dataclass(frozen=True)
 class CloudFile:
-    """A cloud about `origin` (3,) [m], whole numbers; `dropped` points of the file were not finite."""
+    """The cloud of a file, less `dropped` points that were not finite."""
 
     cloud: Cloud
-    origin: FloatArray
     dropped: int
 
 
@@ -99,11 +95,7 @@ def _cloud_file(path: Path, columns: dict[str, NDArray]) -> CloudFile:
             f"{path}: every coordinate is a whole number, and metres in whole numbers hold no pipe: "
             "export it in metres with decimals (millimetres: divide by 1000)"
         )
-    origin = np.zeros(3)
-    if extent > FAR:
-        origin = np.round(np.median(points, axis=0))
-        points -= origin
-    return CloudFile(Cloud(points, _normals(columns, finite)), origin, dropped)
+    return CloudFile(Cloud(points, _normals(columns, finite)), dropped)
 
 
 def _normals(columns: dict[str, NDArray], finite: NDArray[np.bool_]) -> FloatArray | None:

@@ -7,6 +7,7 @@ import json
 import platform
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from decimal import Decimal, InvalidOperation
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +17,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from pipeprog_bringup.output import OutputFolder
 from pipeprog_camera.errors import InputError
+from pipeprog_detect.bill import Bill
 from pipeprog_detect.classify import ClassProgress
 from pipeprog_detect.pipe import Pipe
 
@@ -104,11 +107,28 @@ def write_config(path: Path, config: dict[str, Any]) -> None:
     path.write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
 
 
-def write_run(path: Path, facts: dict[str, Any]) -> None:
-    """run.json: what ran, on what, for how long; versions are added here."""
+def write_run(folder: OutputFolder, facts: dict[str, Any]) -> None:
+    """run.json, the last file of a run: what ran, on what, for how long, with which versions, and what it wrote."""
+    path = folder.file("run.json")
     versions = {"python": platform.python_version(), "pipeprog": package_version("pipeprog_bringup")}
     versions.update({name: package_version(name) for name in _PACKAGES})
-    path.write_text(json.dumps({**facts, "versions": versions}, indent=1) + "\n")
+    names = sorted({*(file.name for file in path.parent.iterdir()), path.name})
+    finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    content = {**facts, "finished": finished, "versions": versions, "files": names}
+    path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def bill_entries(bill: Bill) -> list[dict[str, Any]]:
+    """The bill of quantities as config.yaml holds it."""
+    return [
+        {
+            "name": planned.name,
+            "outer_radius_mm": round(1e3 * planned.outer_radius, 6),
+            "planned_length_m": planned.planned_length,
+            "color": "#" + "".join(f"{round(255 * part):02x}" for part in planned.color),
+        }
+        for planned in bill.classes
+    ]
 
 
 def package_version(name: str) -> str | None:

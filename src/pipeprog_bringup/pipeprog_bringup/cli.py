@@ -1,0 +1,120 @@
+"""The command `pipeprog`.
+
+Whatever takes long to import is imported inside the commands, so that --help answers at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import click
+import typer
+
+app = typer.Typer(
+    name="pipeprog",
+    help="From video of a construction site to the metres of each planned pipe class that are installed.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+Boq = Annotated[Path, typer.Option("--boq", help="Bill of quantities (YAML): the planned classes.", metavar="BOQ.yaml")]
+Out = Annotated[Path, typer.Option("--out", help="Folder for the results.", metavar="DIR")]
+Force = Annotated[bool, typer.Option("--force", help="Replace the results that --out holds.")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", help="Change a setting; may be repeated.", metavar="NODE.PARAM=VALUE")
+]
+
+
+@app.callback(invoke_without_command=True)
+def options(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    """Options of the command itself."""
+    if version:
+        from importlib import metadata
+
+        typer.echo(f"pipeprog {metadata.version('pipeprog_bringup')}")
+        raise typer.Exit
+
+
+@app.command(rich_help_panel="From recordings")
+def detect(
+    cloud: Annotated[Path, typer.Argument(help="Metric point cloud: ply, pcd, las, laz, xyz, txt, csv, pts.")],
+    boq: Boq,
+    out: Out,
+    force: Force = False,
+    overrides: Set = None,
+) -> None:
+    """Find and classify the pipes of a metric point cloud."""
+    from pipeprog_bringup.console import print_progress, share_bar
+    from pipeprog_bringup.detecting import detect_file
+
+    with share_bar("detect") as report:
+        detection = detect_file(cloud, boq, out, overrides or [], force, report)
+    if detection.dropped:
+        _note(f"{detection.dropped} points of {cloud} are not finite and were left out")
+    print_progress(detection.pipes, detection.classes)
+    typer.echo(f"{len(detection.pipes)} pipes in {detection.points} points: {out / 'pipes.json'}")
+
+
+@app.command(rich_help_panel="From results")
+def score(
+    pipes: Annotated[Path, typer.Argument(help="pipes.json of a run.", metavar="DIR/pipes.json")],
+    truth: Annotated[Path, typer.Argument(help="Ground truth.", metavar="TRUTH.json")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of tables.")] = False,
+) -> None:
+    """Compare a result with ground truth: found, classified, radius, length, scale, trajectory."""
+    import json
+
+    from pipeprog_bringup.console import print_score
+    from pipeprog_bringup.score import score_files
+
+    figures = score_files(pipes, truth)
+    if as_json:
+        typer.echo(json.dumps(figures, indent=1, allow_nan=False))
+    else:
+        print_score(figures)
+
+
+def main() -> None:
+    """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
+    from pipeprog_camera.errors import InputError
+
+    try:
+        code = app(prog_name="pipeprog", standalone_mode=False)
+    except InputError as error:
+        _fail(str(error))
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        sys.exit(2)
+    except click.ClickException as error:
+        from typer.rich_utils import rich_format_error
+
+        rich_format_error(error)
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        typer.secho("Interrupted: nothing was written.", fg=typer.colors.YELLOW, err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output has left (`pipeprog ... | head`).
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        _fail(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    sys.exit(code or 0)
+
+
+def _fail(message: str) -> None:
+    typer.secho(f"Error: {message}", fg=typer.colors.RED, err=True)
+    sys.exit(1)
+
+
+def _note(message: str) -> None:
+    typer.secho(f"Note: {message}", fg=typer.colors.YELLOW, err=True)
+
+
+if __name__ == "__main__":
+    main()

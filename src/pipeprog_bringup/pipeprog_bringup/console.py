@@ -1,0 +1,120 @@
+"""What the command shows: progress on stderr, tables on stdout."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from pipeprog_detect.classify import ClassProgress
+    from pipeprog_detect.pipe import Pipe
+
+
+def progress_display() -> Progress:
+    """Bars with their stage, share and time; nothing but the last state where stderr is no terminal."""
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}", table_column=None),
+        BarColumn(bar_width=30),
+        TextColumn("{task.fields[detail]}"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+    )
+
+
+@contextlib.contextmanager
+def share_bar(name: str) -> Iterator[Callable[[float, str], None]]:
+    """One bar, moved by calls with the share done (0..1) and what is being done."""
+    with progress_display() as display:
+        task = display.add_task(name, total=1.0, detail="")
+
+        def report(share: float, stage: str) -> None:
+            display.update(task, completed=share, detail=stage)
+
+        yield report
+
+
+def print_progress(pipes: Sequence[Pipe], classes: Sequence[ClassProgress]) -> None:
+    """Planned and installed metres of each class, and what belongs to none."""
+    table = Table(title="Progress", title_justify="left")
+    table.add_column("class")
+    for name in ("outer radius [mm]", "pipes", "installed [m]", "planned [m]", "%"):
+        table.add_column(name, justify="right")
+    for entry in classes:
+        count = sum(pipe.class_name == entry.name for pipe in pipes)
+        lengths = (f"{entry.installed:.2f}", f"{entry.planned:.2f}", f"{entry.percent:.1f}")
+        table.add_row(entry.name, f"{1e3 * entry.outer_radius:.1f}", str(count), *lengths)
+    others = [pipe for pipe in pipes if pipe.class_name is None]
+    if others:
+        total = sum(pipe.cylinder.length for pipe in others)
+        table.add_row("[dim]no planned class", "", str(len(others)), f"{total:.2f}", "", "")
+    Console().print(table)
+
+
+def print_score(figures: dict[str, Any]) -> None:
+    """The figures of `score` as tables."""
+    console = Console()
+    table = Table(title=f"Found and classified (aligned by {figures['alignment']})", title_justify="left")
+    for name in ("", "true", "false", "missed", "precision", "recall", "F", "accuracy"):
+        table.add_column(name, justify="left" if not name else "right")
+    for key, title in (
+        ("detection", "all detections"),
+        ("planned", "of planned classes"),
+        ("classification", "right class"),
+    ):
+        rates = figures[key]
+        counts = (str(rates[name]) for name in ("true_positives", "false_positives", "false_negatives"))
+        shares = (_number(rates[name], ".3f") for name in ("precision", "recall", "f_measure", "accuracy"))
+        table.add_row(title, *counts, *shares)
+    console.print(table)
+    table = Table(title="Pipes", title_justify="left")
+    for name in (
+        "truth",
+        "found",
+        "class",
+        "radius [mm]",
+        "radius error [mm]",
+        "length [m]",
+        "length error [%]",
+        "off axis [mm]",
+    ):
+        table.add_column(name, justify="left" if name in ("truth", "found", "class") else "right")
+    for pipe in figures["pipes"]:
+        measures = (
+            1e3 * pipe["true_radius"],
+            pipe["radius_error_mm"],
+            pipe["true_length"],
+            pipe["length_error_percent"],
+        )
+        cells = (_number(value, form) for value, form in zip(measures, (".1f", "+.3f", ".3f", "+.2f"), strict=True))
+        table.add_row(
+            pipe["truth"], pipe["id"], pipe["class"] or "none", *cells, _number(pipe["axis_distance_mm"], ".1f")
+        )
+    console.print(table)
+    lines = [
+        ("radius RMSE", figures["radius"]["rmse_mm"], ".3f", "mm"),
+        ("length error, mean", figures["length"]["mean_error_percent"], ".2f", "%"),
+        *((f"metres of {c['class']}", c["error_percent"], "+.2f", "%") for c in figures["length"]["per_class"]),
+        ("scale error", figures["scale"]["error_percent"], "+.4f", "%"),
+    ]
+    if figures["trajectory"]:
+        lines += [
+            ("camera positions, rigid", figures["trajectory"]["rms_rigid_mm"], ".2f", "mm rms"),
+            ("camera positions, similarity", figures["trajectory"]["rms_similarity_mm"], ".2f", "mm rms"),
+            ("worst camera, similarity", figures["trajectory"]["max_similarity_mm"], ".2f", "mm"),
+        ]
+    for name, value, form, unit in lines:
+        if value is not None:
+            console.print(f"{name:<30} {_number(value, form):>10} {unit}", highlight=False)
+    for key in ("missed", "false"):
+        if figures[key]:
+            console.print(f"{key}: {', '.join(figures[key])}", highlight=False, markup=False)
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,78 @@
+"""`pipeprog detect`: the detector's core on a cloud from a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipeprog_bringup import results
+from pipeprog_bringup.cloud_io import read_cloud
+from pipeprog_bringup.output import OutputFolder
+from pipeprog_bringup.overrides import effective
+from pipeprog_detect.bill import Bill, load_bill
+from pipeprog_detect.classify import ClassProgress, progress
+from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.detector import detect
+from pipeprog_detect.pipe import Pipe
+
+# The file's own metres are the scale: none was measured, so nothing is added to the pipes' sigmas.
+SCALE = results.Scale("cloud", 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """What was found in a cloud."""
+
+    pipes: list[Pipe]
+    classes: list[ClassProgress]
+    points: int
+    dropped: int
+
+
+def detect_file(
+    cloud_path: Path,
+    boq_path: Path,
+    out: Path,
+    overrides: Sequence[str],
+    force: bool,
+    report: Callable[[float, str], None],
+) -> Detection:
+    """Detect the pipes of a cloud and write pipes.json, progress.csv, config.yaml and run.json into `out`."""
+    bill = load_bill(boq_path)
+    config: DetectConfig = effective(overrides, ("detect",))["detect"]
+    started = time.time()
+    with OutputFolder(out, force) as folder:
+        report(0.0, "reading the cloud")
+        file = read_cloud(cloud_path)
+        read = time.time()
+        pipes = detect(file.cloud, bill, config, (), report)
+        timings = {"read": read - started, "detect": time.time() - read}
+        detection = Detection(pipes, progress(pipes, bill), len(file.cloud.points), file.dropped)
+        _write(folder, detection, cloud_path, bill, config, timings)
+    return detection
+
+
+def _write(
+    folder: OutputFolder,
+    detection: Detection,
+    cloud_path: Path,
+    bill: Bill,
+    config: DetectConfig,
+    timings: dict[str, float],
+) -> None:
+    results.write_pipes(folder.file("pipes.json"), detection.pipes, detection.classes, SCALE)
+    results.write_progress(folder.file("progress.csv"), detection.pipes, detection.classes)
+    results.write_config(
+        folder.file("config.yaml"), {"detect": dataclasses.asdict(config), "boq": results.bill_entries(bill)}
+    )
+    facts = {
+        "command": "detect",
+        "cloud": str(cloud_path.resolve()),
+        "points": detection.points,
+        "points_dropped": detection.dropped,
+        "seeds": {"detect": config.seed},
+        "timings_s": timings,
+    }
+    results.write_run(folder, facts)
