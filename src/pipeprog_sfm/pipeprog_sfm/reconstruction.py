@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_frames.camera import Camera
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_sfm.board import Board
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import SfmConfig
@@ -70,7 +70,8 @@ class Reconstruction:
         self._mapper = Mapper(config.mapper, config.seed)
         self._targets = BoardTracker(boards, config.board)
         self._encoded: dict[int, tuple[bytes, Camera]] = {}
-        self._image = lru_cache(maxsize=IMAGE_CACHE)(self._decode)
+        self._raw = lru_cache(maxsize=1)(self._decode)
+        self._image = lru_cache(maxsize=IMAGE_CACHE)(self._undistort)
         self._depths: dict[int, Future[_Depth]] = {}
         # One thread beside the mapper's: matching releases Python's lock, and one keeps the order of results fixed.
         self._stereo = ThreadPoolExecutor(max_workers=1)
@@ -84,13 +85,13 @@ class Reconstruction:
         """Takes a keyframe (JPEG or PNG bytes, stamp in ns); raises InputError when it cannot be decoded."""
         self._encoded[stamp] = (encoded, camera)
         try:
-            image = self._image(stamp)
+            gray = cv2.cvtColor(self._raw(stamp), cv2.COLOR_BGR2GRAY)
         except InputError:
             del self._encoded[stamp]
             raise
-        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        report = self._mapper.add(stamp, gray, camera.pinhole())
-        self._targets.add(stamp, gray, camera.pinhole())
+        # Features and targets are measured in the image as it is: their points are undistorted, not resampled.
+        report = self._mapper.add(stamp, gray, camera)
+        self._targets.add(stamp, gray, camera)
         poses = self._mapper.camera_from_model()
         ready = sorted(poses)[:-LOOKAHEAD]
         self._start_depth_maps([other for other in ready if other not in self._depths], poses)
@@ -151,7 +152,7 @@ class Reconstruction:
         )
 
     def _decode(self, stamp: int) -> NDArray[np.uint8]:
-        """The undistorted (H, W, 3) BGR keyframe."""
+        """The keyframe as the camera saw it, (H, W, 3) BGR."""
         encoded, camera = self._encoded[stamp]
         image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
@@ -161,7 +162,11 @@ class Reconstruction:
                 f"the image has {image.shape[1]} x {image.shape[0]} pixels, its CameraInfo says "
                 f"{camera.width} x {camera.height}: calibrate at the size that the camera sends"
             )
-        return camera.undistort_image(image)
+        return image
+
+    def _undistort(self, stamp: int) -> NDArray[np.uint8]:
+        """The keyframe as the ideal pinhole camera sees it, (H, W, 3) BGR."""
+        return self._encoded[stamp][1].undistort_image(self._raw(stamp))
 
     def _stereo_image(self, stamp: int, pose: FloatArray) -> StereoImage:
         return StereoImage(stamp, self._image(stamp), self._encoded[stamp][1].pinhole(), pose)
