@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 from collections.abc import Callable
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from pipeprog_camera.errors import InputError
+
+STOP_LATENCY = 0.1  # [s] a node without work looks this often whether it was told to stop
 
 
 def run(node_type: Callable[[], Node]) -> None:
@@ -17,8 +22,12 @@ def run(node_type: Callable[[], Node]) -> None:
 
     The process exits with 0 after SIGINT or SIGTERM, and with 1 and one line on stderr after an InputError.
     """
+    # rclpy's own handlers invalidate the context while the executor enters its wait, which then fails or never ends.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
     try:
-        rclpy.init()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # arguments or a parameter file that ROS cannot read
         sys.exit(f"error: {error}")
     node = None
@@ -27,9 +36,8 @@ def run(node_type: Callable[[], Node]) -> None:
         node = node_type()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=STOP_LATENCY)
     except InputError as error:
         problem = f"error: {error}"
     finally:
