@@ -12,7 +12,7 @@ from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
-from pipeprog_detect.verify import Candidate, measure
+from pipeprog_detect.verify import Candidate, measure, thin_start
 from pipeprog_frames.errors import InputError
 
 # Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1.05 to 2.9 times as large; coarse to fine,
@@ -20,6 +20,9 @@ from pipeprog_frames.errors import InputError
 _SCALES = (0.16, 0.113, 0.08, 0.056, 0.04, 0.028, 0.02)
 _SITES_PER_SCALE = 1.4
 _POINTS_PER_SCALE = 7.0
+# Pipes up to this radius [m] are sought as lines of points, in neighbourhoods several times as wide.
+_THICKEST_LINE = 0.02
+_LINE_SCALES = (0.04,)
 
 Report = Callable[[float, str], None]
 
@@ -53,14 +56,20 @@ def detect(
     report(0.15, "finding walls")
     _, on_plane = background.find_planes(tree, sigma, widest)
     tree = tree.subset(~on_plane)
-    candidates = find_candidates(tree, sigma, (config.radius_min, widest), config, report)
+    planned_radii = [planned.outer_radius for planned in bill.classes]
+    candidates = find_candidates(tree, sigma, (config.radius_min, widest), planned_radii, config, report)
     pipes = [_pipe(candidate, bill, shift) for candidate in candidates]
     report(1.0, "done")
     return _numbered(pipes)
 
 
 def find_candidates(
-    tree: Octree, sigma: float, radius_range: tuple[float, float], config: DetectConfig, report: Report
+    tree: Octree,
+    sigma: float,
+    radius_range: tuple[float, float],
+    planned_radii: Sequence[float],
+    config: DetectConfig,
+    report: Report,
 ) -> list[Candidate]:
     """Accepted cylinders of the tree's points, coarse scales first, none sharing points with another."""
     free = np.ones(len(tree.points), bool)
@@ -74,6 +83,19 @@ def find_candidates(
         shape = normals.surfaces(fine, sites, scale, sigma)
         for initial, _ in hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range)):
             candidate = measure(tree, free, initial, sigma)
+            if candidate is not None and is_pipe(candidate, sigma, config):
+                accepted.append(candidate)
+                free[claimed(tree, candidate, sigma)] = False
+    report(0.9, "looking for thin pipes")
+    thin = [planned for planned in planned_radii if planned < _THICKEST_LINE] or [0.5 * _THICKEST_LINE]
+    rest = tree.subset(free)
+    for scale in _LINE_SCALES:
+        fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
+        sites = rest.thinned(rest.level_of(0.5 * scale))
+        shape = normals.surfaces(fine, sites, scale, sigma)
+        for line, _ in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
+            initial = thin_start(tree, free, line, 1.3 * sigma, thin)
+            candidate = measure(tree, free, initial, sigma) if initial is not None else None
             if candidate is not None and is_pipe(candidate, sigma, config):
                 accepted.append(candidate)
                 free[claimed(tree, candidate, sigma)] = False
@@ -96,7 +118,8 @@ def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig) -> bool:
         and evidence.coverage > 0.4
         and evidence.inside < 0.15
         and evidence.noise < 2.0 * sigma + 1e-3
-        and evidence.flatness > 2.0
+        and evidence.roundness < 0.3 * sigma + 0.02 * cylinder.radius + 3e-4
+        and evidence.flatness > 1.3
     )
 
 

@@ -13,6 +13,7 @@ _SECTORS = 36
 # A bin of the barrel is seen where its points cover this angle, a bin is empty under this share of its neighbours.
 _LEAST_ARC = np.radians(30.0)
 _LEAST_SHARE = 0.25
+_WAVINESS = 1e-3
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,73 @@ def surface_runs(points: FloatArray, cylinder: Cylinder, gap: float) -> list[Run
         else:
             runs.append(Run(start, end))
     return runs
+
+
+def straight_stretch(points: FloatArray, cylinder: Cylinder, sigma: float) -> Run | None:
+    """The longest stretch of the axis on which the section's centre stays on one line: an elbow's does not.
+
+    points (N, 3) lie near the surface, within a few `sigma` [m]. In each slice the offset of the section is solved
+    for at the given radius; of the lines through two slices the one that most slices agree with is taken (it need not
+    be the cylinder's axis, which an elbow may have tilted), and its slices from the first to the last that agree.
+    """
+    offset = points - cylinder.start
+    along = offset @ cylinder.axis
+    u, v = basis(cylinder.axis)
+    x, y = offset @ u, offset @ v
+    rho = np.hypot(x, y) + 1e-12
+    distance = rho - cylinder.radius
+    length = float(along.max() - along.min())
+    slices = int(np.clip(length / (0.4 * cylinder.radius + 0.01), 6, 60))
+    low = float(along.min())
+    size = length / slices
+    place = np.clip(((along - low) / size).astype(int), 0, slices - 1)
+    cosine, sine = x / rho, y / rho
+    shift, error = _slice_shifts(cosine, sine, distance, place, slices, sigma)
+    known = np.flatnonzero(np.isfinite(error))
+    if len(known) < 4:
+        return Run(low, low + length)
+    # Waviness of a real pipe, and what an elbow may bend off unseen.
+    allowed = 2.5 * error + _WAVINESS + 0.02 * cylinder.radius
+    centre = low + (np.arange(slices) + 0.5) * size
+    best, members = -1.0, known
+    for first in known:
+        for second in known[known > first + slices // 6]:
+            slope = (shift[second] - shift[first]) / (centre[second] - centre[first])
+            miss = np.linalg.norm(
+                shift[known] - shift[first] - (centre[known] - centre[first])[:, None] * slope, axis=1
+            )
+            agree = miss < allowed[known]
+            worth = float(agree.sum()) - float((miss[agree] / allowed[known][agree]).sum()) * 0.5
+            if worth > best:
+                best, members = worth, known[agree]
+    if best < 0:
+        return None
+    # The stretch may bridge slices without points or with an obstacle, not a run of slices that disagree.
+    holes = np.flatnonzero(
+        [np.isin(np.arange(a + 1, b), known).sum() > 2 for a, b in zip(members, members[1:], strict=False)]
+    )
+    parts = np.split(members, holes + 1)
+    longest = max(parts, key=len)
+    return Run(low + longest[0] * size, low + (longest[-1] + 1) * size)
+
+
+def _slice_shifts(
+    cosine: FloatArray, sine: FloatArray, distance: FloatArray, place: FloatArray, slices: int, sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Offset (S, 2) [m] of each slice's section and its standard deviation (S,), NaN where too few points are."""
+
+    def total(values: FloatArray) -> FloatArray:
+        return np.bincount(place, weights=values, minlength=slices)
+
+    count = np.bincount(place, minlength=slices)
+    cc, cs, ss = total(cosine * cosine), total(cosine * sine), total(sine * sine)
+    # A prior of a radius-sized shift would be arbitrary; one sigma on one point only keeps empty slices solvable.
+    cc, ss = cc + 1.0, ss + 1.0
+    cd, sd = total(cosine * distance), total(sine * distance)
+    determinant = cc * ss - cs**2
+    shift = np.stack([(ss * cd - cs * sd) / determinant, (cc * sd - cs * cd) / determinant], axis=1)
+    error = sigma * np.sqrt((cc + ss) / determinant)
+    return shift, np.where((count >= 8) & (error < sigma), error, np.nan)
 
 
 def _local_level(count: FloatArray) -> float:

@@ -16,6 +16,9 @@ _CUT = 4.0
 _ANNEALING = 8
 _MOST_ROUNDS = 40
 _BLOCKS = 16
+# Mean slope of Tukey's psi at that cut under Gaussian noise: what a bias of the residual is worth in the equations.
+_SLOPE = 0.684
+_TENSOR_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -65,24 +68,38 @@ def fit_cylinder(
     only as far as its normal is radial: outward where `signed` (normals towards the sensor), either way otherwise;
     zero normals are not judged. The covariance is the sandwich over blocks along the axis, so noise that is alike in
     neighbouring points is not taken for independent.
+
+    Noise of cameras and scanners lies along the ray, so it differs around the section and shifts a point across and
+    along the surface together; the plain least-squares radius is then too small by several noise variances over the
+    radius. So the noise tensor of the section is estimated from the residuals over the angle, its standard deviation
+    in each direction scales the residuals, and its expected share is taken out of the normal equations.
     """
     if len(points) < 10 or not sigma > 0:
         return None
     given = normals if normals is not None else np.zeros((0, 3))
     middle = 0.5 * (initial.start + initial.end)
     radius = initial.radius if fixed_radius is None else fixed_radius
+    free_radius = fixed_radius is None
+    tensor = sigma**2 * np.eye(3)
     ok, centre, axis, radius = _iterate(
-        points, given, signed, middle, initial.axis, radius, sigma, reach, fixed_radius is None
+        points, given, signed, middle, initial.axis, radius, tensor, reach, free_radius, False
     )
+    for _ in range(_TENSOR_ROUNDS):
+        if not ok or not np.isfinite(centre).all() or radius <= 0:
+            return None
+        tensor = _noise_tensor(points, given, signed, centre, axis, radius, sigma)
+        ok, centre, axis, radius = _iterate(points, given, signed, centre, axis, radius, tensor, 1.0, free_radius, True)
     if not ok or not np.isfinite(centre).all() or radius <= 0:
         return None
     offset = points - centre
     along = offset @ axis
-    distance = np.linalg.norm(offset - along[:, None] * axis, axis=1) - radius
-    weight = np.clip(1.0 - (distance / (_CUT * sigma)) ** 2, 0.0, None) ** 2
+    radial = offset - along[:, None] * axis
+    distance = np.linalg.norm(radial, axis=1) - radius
+    spread = _spread_across(radial, tensor)
+    weight = np.clip(1.0 - (distance / (_CUT * spread)) ** 2, 0.0, None) ** 2 * (sigma / spread) ** 2
     if normals is not None:
-        weight *= _gate(offset - along[:, None] * axis, normals, signed)
-    inliers = np.asarray((weight > 0) & (np.abs(distance) < 3.0 * sigma))
+        weight *= _gate(radial, normals, signed)
+    inliers = np.asarray((weight > 0) & (np.abs(distance) < 3.0 * spread))
     if inliers.sum() < 10:
         return None
     low, high = np.quantile(along[inliers], [0.0, 1.0])
@@ -108,6 +125,44 @@ def _gate(radial: FloatArray, normals: FloatArray, signed: bool) -> FloatArray:
     cosine = np.einsum("ij,ij->i", radial, normals) / np.maximum(np.linalg.norm(radial, axis=1), 1e-12)
     gate = np.clip(((cosine if signed else np.abs(cosine)) - 0.6) / 0.3, 0.0, 1.0)
     return np.where((normals == 0).all(axis=1), 1.0, gate)
+
+
+def _spread_across(radial: FloatArray, tensor: FloatArray) -> FloatArray:
+    """Standard deviation [m] of the noise along each of the vectors (N, 3)."""
+    unit = radial / np.maximum(np.linalg.norm(radial, axis=1), 1e-12)[:, None]
+    return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", unit, tensor, unit)))
+
+
+def _noise_tensor(
+    points: FloatArray,
+    normals: FloatArray,
+    signed: bool,
+    centre: FloatArray,
+    axis: FloatArray,
+    radius: float,
+    sigma: float,
+) -> FloatArray:
+    """Covariance (3, 3) [m2] of the noise in the section: the squared residuals as n . M . n over the normals n."""
+    u, v = basis(axis)
+    offset = points - centre
+    x, y = offset @ u, offset @ v
+    rho = np.hypot(x, y) + 1e-12
+    distance = rho - radius
+    near = np.abs(distance) < _CUT * sigma
+    if len(normals):
+        near &= _gate(offset - (offset @ axis)[:, None] * axis, normals, signed) > 0
+    if near.sum() < 50:
+        return sigma**2 * np.eye(3)
+    x, y, square = x[near] / rho[near], y[near] / rho[near], distance[near] ** 2
+    rows = np.stack([x * x, 2 * x * y, y * y], axis=1)
+    # A few dozen points' worth of the cloud's typical noise keeps directions without points sensible.
+    prior = 30.0 * np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, 1.0]])
+    mxx, mxy, myy = np.linalg.solve(rows.T @ rows + prior, rows.T @ square + prior @ [sigma**2, 0.0, sigma**2])
+    values, vectors = np.linalg.eigh(np.array([[mxx, mxy], [mxy, myy]]))
+    values = np.clip(values, (0.25 * sigma) ** 2, (1.5 * sigma) ** 2)
+    plane = vectors @ np.diag(values) @ vectors.T
+    frame = np.stack([u, v])
+    return np.asarray(frame.T @ plane @ frame + sigma**2 * np.outer(axis, axis))
 
 
 def _sandwich(
@@ -147,9 +202,10 @@ def _iterate(
     centre: FloatArray,
     axis: FloatArray,
     radius: float,
-    sigma: float,
+    tensor: FloatArray,
     reach: float,
     free_radius: bool,
+    corrected: bool,
 ) -> tuple[bool, FloatArray, FloatArray, float]:
     centre, axis = centre.copy(), axis.copy()
     gated = len(normals) > 0
@@ -157,7 +213,6 @@ def _iterate(
     used = 5 if free_radius else 4
     for turn in range(_MOST_ROUNDS):
         wide = max(1.0, reach + (1.0 - reach) * turn / (_ANNEALING - 1.0))
-        cut = _CUT * sigma * wide
         # A frame normal to the axis.
         least = 0
         for k in range(1, 3):
@@ -168,11 +223,14 @@ def _iterate(
         u = np.cross(axis, helper)
         u /= np.sqrt(u @ u)
         v = np.cross(axis, u)
+        muu, muv, mvv = u @ tensor @ u, u @ tensor @ v, v @ tensor @ v
+        typical = 0.5 * (muu + mvv)
         # Levers are taken about the mean of the weighted points, else shift and tilt are nearly the same unknown.
         lever, total = 0.0, 0.0
         matrix = np.zeros((5, 5))
         right = np.zeros(5)
         row = np.empty(5)
+        turned = np.empty(5)
         for sweep in range(2):
             for i in range(count):
                 ox, oy, oz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
@@ -180,27 +238,38 @@ def _iterate(
                 y = ox * v[0] + oy * v[1] + oz * v[2]
                 rho = np.sqrt(x * x + y * y) + 1e-12
                 d = rho - radius
-                if abs(d) >= cut:
-                    continue
-                z = ox * axis[0] + oy * axis[1] + oz * axis[2]
-                weight = (1.0 - (d / cut) ** 2) ** 2
                 x /= rho
                 y /= rho
+                variance = x * x * muu + 2.0 * x * y * muv + y * y * mvv
+                share = d * d / (variance * (_CUT * wide) ** 2)
+                if share >= 1.0:
+                    continue
+                z = ox * axis[0] + oy * axis[1] + oz * axis[2]
+                weight = (1.0 - share) ** 2 * typical / variance
+                gate = 1.0
                 if gated:
                     nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
                     if nx != 0.0 or ny != 0.0 or nz != 0.0:
                         cosine = x * (nx * u[0] + ny * u[1] + nz * u[2]) + y * (nx * v[0] + ny * v[1] + nz * v[2])
                         if not signed:
                             cosine = abs(cosine)
-                        weight *= min(max((cosine - 0.6) / 0.3, 0.0), 1.0)
+                        gate = min(max((cosine - 0.6) / 0.3, 0.0), 1.0)
+                        weight *= gate
                 if sweep == 0:
                     lever += weight * z
                     total += weight
                     continue
                 z -= lever
                 row[0], row[1], row[2], row[3], row[4] = -x, -y, -z * x, -z * y, -1.0
+                # Second order in the noise: its sideways part turns the normal and lies off the tangent.
+                turned[0], turned[1], turned[2], turned[3], turned[4] = y, -x, z * y, -z * x, 0.0
+                across = (x * x - y * y) * muv + x * y * (mvv - muu)
+                sideways = y * y * muu - 2.0 * x * y * muv + x * x * mvv
+                expected = gate * _SLOPE * typical / (variance * radius)
                 for a in range(used):
                     right[a] -= weight * d * row[a]
+                    if corrected:
+                        right[a] += expected * (across * turned[a] + 0.5 * sideways * row[a])
                     for b in range(a, used):
                         matrix[a, b] += weight * row[a] * row[b]
             if sweep == 0:

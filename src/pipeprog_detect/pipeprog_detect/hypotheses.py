@@ -47,6 +47,18 @@ def votes_of(shape: Surfaces, sigma: float, radius_range: tuple[float, float]) -
     return Votes(centres, shape.directions[good], 1.0 / bend[good], shape.scale)
 
 
+def line_votes(shape: Surfaces, sigma: float, thickest: float) -> Votes:
+    """Votes of the sites whose points lie along a line, for pipes too thin to show a bend: radii up to thickest [m].
+
+    The points of half a pipe spread by at most r / sqrt(2) and the noise across, and by h / sqrt(3) along.
+    """
+    across = np.sqrt(0.5 * thickest**2 + (1.5 * sigma) ** 2)
+    good = (shape.count > 0) & (shape.spread[:, 2] > 0.45 * shape.scale)
+    good &= (shape.spread[:, 1] < across) & (shape.spread[:, 1] < 0.5 * shape.spread[:, 2])
+    radii = np.full(int(good.sum()), thickest)
+    return Votes(shape.centres[good], shape.line[good], radii, shape.scale)
+
+
 def consensus(votes: Votes) -> list[tuple[Cylinder, int]]:
     """Hypotheses, best supported first: each a cylinder through collinear votes, and how many they are.
 

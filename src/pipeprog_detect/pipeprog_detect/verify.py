@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_detect.extent import Run, surface_runs
-from pipeprog_detect.fit import CylinderFit, covered_arc, fit_cylinder
+from pipeprog_detect.extent import Run, straight_stretch, surface_runs
+from pipeprog_detect.fit import CylinderFit, basis, covered_arc, fit_cylinder
 from pipeprog_detect.octree import IntArray, Octree
 from pipeprog_detect.pipe import Cylinder, FloatArray
 
@@ -22,7 +23,8 @@ class Evidence:
 
     arc [rad] of the surface seen; coverage: share of the length that shows surface; inside: points within the barrel,
     well under its surface, per point on it; beyond: points close outside the seen surface, per point on it;
-    noise [m]: spread of the points across the surface; flatness: mean square from the best plane over the mean square
+    noise [m]: spread of the points across the surface; roundness [m]: root mean square over the sectors of the
+    section of their mean distance from the circle, 0 for a true one; flatness: mean square from the best plane over the mean square
     from the cylinder.
     """
 
@@ -31,6 +33,7 @@ class Evidence:
     inside: float
     beyond: float
     noise: float
+    roundness: float
     flatness: float
 
 
@@ -59,7 +62,8 @@ def measure(tree: Octree, free: NDArray[np.bool_], initial: Cylinder, sigma: flo
         axis = cylinder.axis
         step = max(0.5 * cylinder.length, 0.25, 4.0 * cylinder.radius) if turn else 0.0
         start, end = cylinder.start - step * axis, cylinder.end + step * axis
-        reach = 4.0 if turn == 0 else 1.5
+        # Hypotheses are right to a tenth of the radius; a wider reach would take in the neighbour of a rack.
+        reach = 1.0 + 0.1 * cylinder.radius / wide if turn == 0 else 1.2
         rows = tree.near_segment(start, end, cylinder.radius + 4.0 * wide * reach)
         rows = rows[free[rows]]
         if len(rows) < 30:
@@ -67,14 +71,18 @@ def measure(tree: Octree, free: NDArray[np.bool_], initial: Cylinder, sigma: flo
         points = tree.points[rows]
         if turn:
             distance = _signed_distance(points, cylinder)
-            runs = _connected(surface_runs(points[np.abs(distance) < 3.0 * wide], cylinder, 0.0), cylinder)
+            skin = points[np.abs(distance) < 3.0 * wide]
+            straight = straight_stretch(skin, cylinder, wide) if len(skin) > 30 else None
+            if straight is None:
+                return None
+            skin = _within(skin, cylinder, straight)
+            runs = _connected(surface_runs(skin, cylinder, 0.0), cylinder)
             if not runs:
                 return None
             low, high = runs[0].low, runs[-1].high
             grown = max(-low, high - cylinder.length)
             cylinder = _cut(cylinder, low, high)
-            along = (points - cylinder.start) @ cylinder.axis
-            points = points[(along >= 0) & (along <= cylinder.length)]
+            points = _within(points, cylinder, Run(0.0, cylinder.length))
         else:
             grown = np.inf
         fit = fit_cylinder(_spread_out(points, _FIT_POINTS), None, cylinder, wide, reach=reach)
@@ -85,6 +93,34 @@ def measure(tree: Octree, free: NDArray[np.bool_], initial: Cylinder, sigma: flo
         if grown < 0.02 and turn >= 2:
             break
     return _finish(tree, free, cylinder, wide)
+
+
+def thin_start(
+    tree: Octree, free: NDArray[np.bool_], line: Cylinder, sigma: float, radii: Sequence[float]
+) -> Cylinder | None:
+    """The cylinder, of those of the given radii about a line through the points of a thin pipe, that explains most.
+
+    The line runs through the mean of the points, that is before the axis by about half a radius on a side that is
+    not known: each of eight sides is tried.
+    """
+    axis = line.axis
+    u, v = basis(axis)
+    rows = tree.near_segment(line.start, line.end, 2.5 * max(radii) + 4.0 * sigma)
+    points = _spread_out(tree.points[rows[free[rows]]], 1500)
+    best, most = None, 0.0
+    for radius in radii:
+        for angle in np.arange(8) * (np.pi / 4):
+            shift = 0.6 * radius * (np.cos(angle) * u + np.sin(angle) * v)
+            initial = Cylinder(line.start + shift, line.end + shift, radius)
+            fit = fit_cylinder(points, None, initial, sigma, reach=1.0)
+            if fit is None or not 0.6 * min(radii) < fit.cylinder.radius < 1.5 * max(radii):
+                continue
+            share = np.clip(1.0 - (_signed_distance(points, fit.cylinder) / (4.0 * sigma)) ** 2, 0.0, None)
+            # The worth of a residual within the noise, per point; a wider circle fits a blob no better by that.
+            worth = float((share**2).sum())
+            if worth > most:
+                best, most = fit.cylinder, worth
+    return best
 
 
 def _finish(tree: Octree, free: NDArray[np.bool_], cylinder: Cylinder, wide: float) -> Candidate | None:
@@ -100,7 +136,12 @@ def _finish(tree: Octree, free: NDArray[np.bool_], cylinder: Cylinder, wide: flo
     cylinder = _between(fit.cylinder, cylinder)
     distance = _signed_distance(points, cylinder)
     on = np.abs(distance) < 3.0 * wide
-    runs = _connected(surface_runs(points[on], cylinder, 0.0), cylinder)
+    if on.sum() < 30:
+        return None
+    straight = straight_stretch(points[on], cylinder, wide)
+    if straight is None:
+        return None
+    runs = _connected(surface_runs(_within(points[on], cylinder, straight), cylinder, 0.0), cylinder)
     if not runs:
         return None
     cut = _cut(cylinder, runs[0].low, runs[-1].high)
@@ -129,7 +170,22 @@ def _evidence(
     lateral = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
     values = np.linalg.eigvalsh(lateral.T @ lateral / len(lateral))
     square = float(np.mean(distance**2))
-    return Evidence(arc, coverage, inside, beyond, float(np.sqrt(square)), float(values[1]) / max(square, 1e-12))
+    roundness = _roundness(surface, cylinder, distance)
+    return Evidence(
+        arc, coverage, inside, beyond, float(np.sqrt(square)), roundness, float(values[1]) / max(square, 1e-12)
+    )
+
+
+def _roundness(points: FloatArray, cylinder: Cylinder, distance: FloatArray, sectors: int = 36) -> float:
+    u, v = basis(cylinder.axis)
+    offset = points - cylinder.start
+    sector = ((np.arctan2(offset @ v, offset @ u) + np.pi) * (sectors / (2 * np.pi))).astype(int) % sectors
+    count = np.bincount(sector, minlength=sectors)
+    mean = np.bincount(sector, weights=distance, minlength=sectors) / np.maximum(count, 1)
+    # What the noise of a sector's mean adds is taken out.
+    own = np.var(distance) / np.maximum(count, 1)
+    square = np.average(mean**2 - own, weights=count)
+    return float(np.sqrt(max(square, 0.0)))
 
 
 def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
@@ -137,6 +193,11 @@ def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
     along = offset @ cylinder.axis
     square = np.einsum("ij,ij->i", offset, offset) - along**2
     return np.asarray(np.sqrt(np.maximum(square, 0.0)) - cylinder.radius)
+
+
+def _within(points: FloatArray, cylinder: Cylinder, run: Run) -> FloatArray:
+    along = (points - cylinder.start) @ cylinder.axis
+    return points[(along >= run.low) & (along <= run.high)]
 
 
 def _connected(runs: list[Run], cylinder: Cylinder) -> list[Run]:
