@@ -69,7 +69,7 @@ def refine(
     step = _vote(cylinder, initial_radius_sigma, views, others, basis, planned_radii)
     if step is None:
         return None
-    view_offset = np.zeros(len(views))
+    view_offset: FloatArray = np.zeros(len(views))
     prior = np.zeros(5)
     prior[:4] = 1.0 / (2.0 * initial_radius_sigma) ** 2
     for reach in (2.5, 1.5, 1.2, 1.2):

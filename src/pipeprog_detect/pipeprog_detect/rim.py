@@ -62,7 +62,7 @@ def find_end(
     typical = float(np.median(np.abs(edges[seen])))
     strength = np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0)
     count = seen.sum(axis=0)
-    vote = np.where(count >= 2 * SECTORS, strength.sum(axis=0) / np.maximum(count, 1), 0.0)
+    vote = strength.sum(axis=0) / (count + SECTORS)
     score = np.interp(along, position, contrast, left=-1.0, right=-1.0) + vote
     best = int(np.argmax(score))
     if np.interp(along[best], position, contrast) < MIN_CONTRAST:
@@ -110,9 +110,10 @@ def _slopes(axis: FloatArray, end: FloatArray, radius: float, along: FloatArray,
     points = end + along[None, :, None] * axis + radius * radial[:, None]
     pixel, depth = project(view, points.reshape(-1, 3))
     camera = view.camera
-    inside = (depth > 0.05) & (pixel > 2).all(axis=1)
-    inside &= (pixel[:, 0] < camera.width - 3) & (pixel[:, 1] < camera.height - 3)
-    inside = inside.reshape(SECTORS, RAYS_PER_SECTOR, -1).all(axis=1)
+    sharp = (
+        (depth > 0.05) & (pixel > 2).all(axis=1) & (pixel[:, 0] < camera.width - 3) & (pixel[:, 1] < camera.height - 3)
+    )
+    inside = sharp.reshape(SECTORS, RAYS_PER_SECTOR, -1).all(axis=1)
     where = pixel.astype(np.float32).reshape(len(angle), len(along), 2)
     light = cv2.LUT(view.image, LINEAR_LIGHT)
     light = cv2.remap(light, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -1,0 +1,83 @@
+"""Fixtures of the contour tests: a ray-cast pipe before a textured wall with a lamp's shadow beside it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeprog_detect.pipe import Cylinder, View
+from pipeprog_frames.camera import Camera
+
+WALL_DEPTH = 0.12
+SAMPLES = 2
+
+
+def _look_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """camera_from_map (4, 4) of a camera at `centre` that looks at `target` with the map's z upwards."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return pose
+
+
+def _render(cylinder: Cylinder | None, pose: np.ndarray, camera: Camera, shadow_at: float, seed: int) -> np.ndarray:
+    """Grey image (H, W) uint8; the wall is the plane y = WALL_DEPTH, the shadow's edge on it lies at x = shadow_at."""
+    columns, rows = ((np.arange(size * SAMPLES) + 0.5) / SAMPLES - 0.5 for size in (camera.width, camera.height))
+    u, v = np.meshgrid(columns, rows)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1) @ pose[:3, :3]
+    centre = -pose[:3, :3].T @ pose[:3, 3]
+    on_wall = centre + rays * ((WALL_DEPTH - centre[1]) / rays[..., 1])[..., None]
+    texture = np.random.default_rng(7)
+    light = np.full(u.shape, 0.30)
+    for frequency, phase in zip(texture.normal(0, 60, (8, 2)), texture.uniform(0, 6.28, 8), strict=True):
+        light += 0.012 * np.cos(on_wall[..., 0] * frequency[0] + on_wall[..., 2] * frequency[1] + phase)
+    in_shadow = (on_wall[..., 0] > shadow_at) & (on_wall[..., 0] < shadow_at + 0.08)
+    light = np.where(in_shadow, 0.25 * light, light)
+    if cylinder is not None:
+        axis = cylinder.axis
+        offset = centre - cylinder.start
+        across = rays - (rays @ axis)[..., None] * axis
+        offset_across = offset - (offset @ axis) * axis
+        a, b = (across**2).sum(-1), across @ offset_across
+        root = b**2 - a * (offset_across @ offset_across - cylinder.radius**2)
+        depth = (-b - np.sqrt(np.maximum(root, 0.0))) / a
+        along = offset @ axis + depth * (rays @ axis)
+        hit = (root > 0) & (along > 0) & (along < cylinder.length)
+        normal = (offset_across + depth[..., None] * across) / cylinder.radius
+        lamp = np.array([-0.5, -0.8, 0.3]) / np.linalg.norm([0.5, 0.8, 0.3])
+        light = np.where(hit, 0.08 + 0.12 * np.clip(normal @ lamp, 0.0, None), light)
+    light = light.reshape(camera.height, SAMPLES, camera.width, SAMPLES).mean(axis=(1, 3))
+    light = cv2.GaussianBlur(light, (0, 0), 0.5)
+    level = np.where(light < 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-6) ** (1 / 2.4) - 0.055)
+    noise = np.random.default_rng(seed).normal(0.0, 1.0, level.shape)
+    return np.clip(np.round(255 * level + noise), 0, 255).astype(np.uint8)
+
+
+def _walk(cylinder: Cylinder | None, shadow_at: float, count: int = 8) -> list[View]:
+    """Views from a walk of 0.9 m past the pipe at 1.2 m from it."""
+    camera = Camera(480, 270, 345.0, 345.0, 239.5, 134.5)
+    views = []
+    for index, x in enumerate(np.linspace(-0.45, 0.45, count)):
+        centre = np.array([x, -1.2, 0.08 * np.sin(3.0 * index)])
+        pose = _look_at(centre, np.array([0.3 * x, 0.0, 0.0]))
+        views.append(View(index, _render(cylinder, pose, camera, shadow_at, index), camera, pose))
+    return views
+
+
+PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
+
+
+@pytest.fixture(scope="session")
+def pipe_views() -> list[View]:
+    """A walk past the pipe; the shadow's edge on the wall lies 5 mm beside the outline and is the stronger one."""
+    return _walk(PIPE, shadow_at=0.055)
+
+
+@pytest.fixture(scope="session")
+def empty_views() -> list[View]:
+    """The same walk without the pipe."""
+    return _walk(None, shadow_at=0.055, count=4)
