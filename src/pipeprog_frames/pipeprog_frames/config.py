@@ -48,3 +48,12 @@ class FramesConfig:
             "unit": "",
         },
     )
+    image_transport: str = field(
+        default="any",
+        metadata={
+            "description": "the image topics to subscribe: image, image/compressed, or any of the two; "
+            "a camera that publishes both needs a choice, or each image comes twice",
+            "unit": "",
+            "choices": ("any", "raw", "compressed"),
+        },
+    )

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray
-from pipeprog_msgs.srv import Finish
-from pipeprog_node.diagnostics import Diagnostics
-from pipeprog_node.main import run
-from pipeprog_node.parameters import declare
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -24,7 +20,12 @@ from pipeprog_frames.errors import InputError
 from pipeprog_frames.ring import Frame, FrameRing
 from pipeprog_frames.selector import Decision, FrameSelector
 from pipeprog_frames.tracker import GrayImage, reduction
+from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray
+from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
+from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.main import run
+from pipeprog_node.parameters import declare
 
 MAX_QUEUE = 30  # one second of a fast camera; more would only be late
 MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
@@ -58,9 +59,12 @@ class FramesNode(Node):
         self._infos = self.create_publisher(CameraInfo, "keyframes/camera_info", qos.reliable(50))
         # Live, a late image is worth less than a fresh one; a recording must lose none.
         source = qos.reliable(MAX_QUEUE) if self._config.lockstep else qos.sensor(10)
-        self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, source)
-        self.create_subscription(CompressedImage, "image/compressed", self._on_image, source)
-        self.create_subscription(Image, "image", self._on_image, source)
+        subscribe = partial(self.create_subscription, qos_profile=source, qos_overriding_options=qos.OVERRIDABLE)
+        subscribe(CameraInfo, "camera_info", self._on_camera_info)
+        if self._config.image_transport != "raw":
+            subscribe(CompressedImage, "image/compressed", self._on_image)
+        if self._config.image_transport != "compressed":
+            subscribe(Image, "image", self._on_image)
         self.create_subscription(ImageOverlapArray, "image_overlap", self._on_overlap, qos.reliable(50))
         self.create_service(Finish, "~/finish", self._on_finish)
         self._diagnostics = Diagnostics(self, "keyframes", self._health)

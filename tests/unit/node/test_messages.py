@@ -18,12 +18,12 @@ from pipeprog_camera.errors import InputError
 from pipeprog_node import messages
 
 ROWS, COLUMNS = 4, 6
-COLOR: NDArray[np.uint8] = np.random.default_rng(0).integers(0, 256, (ROWS, COLUMNS, 3)).astype(np.uint8)  # BGR
-GREY: NDArray[np.uint8] = COLOR[:, :, 0]
+COLOR = np.random.default_rng(0).integers(0, 256, (ROWS, COLUMNS, 3)).astype(np.uint8)  # BGR
+GREY = COLOR[:, :, 0]
 
 
 def image(encoding: str, pixels: NDArray, padding: int = 0, is_bigendian: bool = False) -> Image:
-    rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(ROWS, -1)
+    rows: NDArray[np.uint8] = np.ascontiguousarray(pixels).view(np.uint8).reshape(ROWS, -1)
     rows = np.pad(rows, ((0, 0), (0, padding)))
     return Image(
         height=ROWS,

@@ -1,0 +1,100 @@
+"""The graph on a robot: frames, sfm and detect on the topics of one camera.
+
+ros2 launch pipeprog_bringup pipeprog.launch.py boq:=site.yaml board:=board.yaml image:=/camera/image_raw \
+    camera_info:=/camera/camera_info
+"""
+
+import os
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+ARGUMENTS = [
+    DeclareLaunchArgument("boq", description="Bill of quantities: YAML file of the planned pipe classes."),
+    DeclareLaunchArgument(
+        "board",
+        default_value="",
+        description="YAML file of the target boards on site, which give the scale. Without any source of scale "
+        "nothing metric is published.",
+    ),
+    DeclareLaunchArgument(
+        "image",
+        default_value="image",
+        description="Topic of the camera's raw images, sensor_msgs/Image.",
+    ),
+    DeclareLaunchArgument(
+        "compressed_image",
+        default_value=[LaunchConfiguration("image"), "/compressed"],
+        description="Topic of the camera's JPEG or PNG images, sensor_msgs/CompressedImage.",
+    ),
+    DeclareLaunchArgument(
+        "camera_info",
+        default_value="camera_info",
+        description="Topic of the camera's calibration, sensor_msgs/CameraInfo. K = 0 is refused.",
+    ),
+    DeclareLaunchArgument(
+        "image_transport",
+        default_value="compressed",
+        choices=["raw", "compressed"],
+        description="Which of the two image topics is subscribed.",
+    ),
+    DeclareLaunchArgument(
+        "params_file",
+        default_value=os.path.join(get_package_share_directory("pipeprog_bringup"), "config", "default.yaml"),
+        description="Settings of the nodes; config/spot.yaml beside the default is for Spot-style robots.",
+    ),
+    DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
+    DeclareLaunchArgument(
+        "use_sim_time",
+        default_value="false",
+        choices=["true", "false"],
+        description="Take the time from /clock: true for simulation and for recordings.",
+    ),
+    DeclareLaunchArgument(
+        "log_level",
+        default_value="info",
+        choices=["debug", "info", "warn", "error", "fatal"],
+        description="Least severity of what the nodes log.",
+    ),
+]
+
+
+def pipeprog_node(name: str, parameters: dict, remappings: list) -> Node:
+    """One node of the graph; what `parameters` says goes before the parameter file."""
+    use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    return Node(
+        package=f"pipeprog_{name}",
+        executable=f"{name}_node",
+        name=name,
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time, **parameters}],
+        remappings=remappings,
+        ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+        output="screen",
+    )
+
+
+def text(argument: str) -> ParameterValue:
+    """The argument as a text parameter, whatever it looks like."""
+    return ParameterValue(LaunchConfiguration(argument), value_type=str)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Arguments and nodes."""
+    camera = [
+        ("image", LaunchConfiguration("image")),
+        ("image/compressed", LaunchConfiguration("compressed_image")),
+        ("camera_info", LaunchConfiguration("camera_info")),
+    ]
+    return LaunchDescription(
+        [
+            *ARGUMENTS,
+            pipeprog_node("frames", {"image_transport": text("image_transport")}, camera),
+            pipeprog_node("sfm", {"board": text("board")}, []),
+            pipeprog_node("detect", {"boq": text("boq")}, []),
+        ]
+    )
