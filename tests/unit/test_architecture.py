@@ -1,0 +1,125 @@
+"""The rules that hold the house up (docs/architecture.md), read from the sources."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))
+PYTHON_PACKAGES = [package for package in PACKAGES if (package / "setup.py").exists()]
+MODULES = [path for package in PYTHON_PACKAGES for path in sorted((package / package.name).rglob("*.py"))]
+
+# Who may import whom; every package may use itself and pipeprog_camera.
+CORES = {"pipeprog_frames", "pipeprog_sfm", "pipeprog_detect"}
+ALLOWED = {
+    "pipeprog_camera": set(),
+    "pipeprog_node": set(),
+    **{core: set() for core in CORES},
+    "pipeprog_bringup": {*CORES, "pipeprog_node", "pipeprog_msgs"},
+}
+ALLOWED_IN_NODES = {"pipeprog_node", "pipeprog_msgs"}
+# The modules beside the cores' node.py that speak ROS.
+GLUE = {
+    "pipeprog_node": {"parameters", "qos", "diagnostics", "messages", "main", "worker"},
+    "pipeprog_bringup": {"replay", "graph"},
+}
+ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|launch(_ros)?|tf2_ros|ament_index_python")
+
+# Import name -> dependency in package.xml; None: no rosdep key, requirements.txt installs it.
+DEPENDENCIES = {
+    "cv2": "python3-opencv",
+    "matplotlib": "python3-matplotlib",
+    "numba": "python3-numba",
+    "numpy": "python3-numpy",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
+    "typer": "python3-typer",
+    "yaml": "python3-yaml",
+    "click": None,
+    "laspy": None,
+    "lz4": None,
+    "mcap": None,
+    "mcap_ros2": None,
+    "plyfile": None,
+    "pycolmap": None,
+    "pypcd4": None,
+    "zstandard": None,
+}
+
+
+def imports(path: Path) -> set[str]:
+    """Top-level names of the absolute imports of a file, those inside functions included."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+def owner(path: Path) -> str:
+    return path.relative_to(ROOT / "src").parts[0]
+
+
+def ids(path: Path) -> str:
+    return str(path.relative_to(ROOT / "src"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=ids)
+def test_only_nodes_and_their_glue_know_ros(path: Path) -> None:
+    package = owner(path)
+    if (package in CORES and path.stem == "node") or path.stem in GLUE.get(package, ()):
+        return
+    assert not {name for name in imports(path) if ROS.fullmatch(name)}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=ids)
+def test_imports_cross_packages_in_one_direction(path: Path) -> None:
+    package = owner(path)
+    allowed = {package, "pipeprog_camera"} | ALLOWED[package]
+    if package in CORES and path.stem == "node":
+        allowed |= ALLOWED_IN_NODES
+    assert {name for name in imports(path) if name.startswith("pipeprog_")} <= allowed
+
+
+@pytest.mark.parametrize("path", MODULES, ids=ids)
+def test_one_module_imports_pycolmap(path: Path) -> None:
+    assert "pycolmap" not in imports(path) or path == ROOT / "src/pipeprog_sfm/pipeprog_sfm/colmap.py"
+
+
+def manifest(package: Path) -> ElementTree.Element:
+    return ElementTree.parse(package / "package.xml").getroot()
+
+
+def test_all_versions_are_equal() -> None:
+    versions = {package.name: manifest(package).findtext("version") for package in PACKAGES}
+    for package in PYTHON_PACKAGES:
+        found = re.search(r'version="([^"]+)"', (package / "setup.py").read_text())
+        assert found is not None
+        versions[f"{package.name}/setup.py"] = found.group(1)
+    assert len(set(versions.values())) == 1, versions
+
+
+@pytest.mark.parametrize("package", PYTHON_PACKAGES, ids=lambda package: package.name)
+def test_manifest_names_what_the_package_imports(package: Path) -> None:
+    files = [path for path in MODULES if owner(path) == package.name] + sorted(package.glob("launch/*.py"))
+    imported = set().union(*map(imports, files)) - set(sys.stdlib_module_names) - {package.name}
+    needed = {key for name in imported if (key := DEPENDENCIES.get(name, name)) is not None}
+    declared = {element.text or "" for element in manifest(package).findall("exec_depend")}
+    assert needed <= declared, f"add to package.xml: {sorted(needed - declared)}"
+
+
+def test_manifest_of_the_messages_names_the_packages_they_use() -> None:
+    package = ROOT / "src" / "pipeprog_msgs"
+    used = {"builtin_interfaces"}
+    for path in [*package.glob("msg/*.msg"), *package.glob("srv/*.srv")]:
+        used |= set(re.findall(r"^(\w+)/\w+", path.read_text(), re.MULTILINE))
+    declared = {element.text for element in manifest(package).findall("depend")}
+    assert used <= declared
