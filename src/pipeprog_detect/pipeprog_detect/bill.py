@@ -10,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.errors import InputError
 
 Color = tuple[float, float, float]
 

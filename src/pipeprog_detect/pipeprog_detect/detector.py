@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.errors import InputError
 from pipeprog_detect import background, classify, hypotheses, normals, octree
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.verify import Candidate, measure, thin_start
-from pipeprog_frames.errors import InputError
 
 # Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1.05 to 2.9 times as large; coarse to fine,
 # each on what the ones before have not explained.

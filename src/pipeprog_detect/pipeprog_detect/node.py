@@ -8,25 +8,25 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Path
-from pipeprog_msgs import msg, srv
-from pipeprog_node.diagnostics import Diagnostics
-from pipeprog_node.main import run
-from pipeprog_node.parameters import declare
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_detect.bill import Bill, load_bill
 from pipeprog_detect.classify import ClassProgress
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.markers import pipe_markers
 from pipeprog_detect.pipe import Pipe
 from pipeprog_detect.worker import Keyframe, Map, PipesReady, serve
-from pipeprog_frames.camera import Camera
-from pipeprog_frames.errors import InputError
+from pipeprog_msgs import msg, srv
 from pipeprog_node import messages, qos
+from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.main import run
+from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
 
 MAX_PENDING = 4  # maps of which only a part has arrived

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pipeprog_frames.camera import Camera
+
+from pipeprog_camera.camera import Camera
 
 FloatArray = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.camera import Camera
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.classify import ClassProgress, progress
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.pipe import Cloud, Pipe, View
-from pipeprog_frames.camera import Camera
 
 
 @dataclass(frozen=True)

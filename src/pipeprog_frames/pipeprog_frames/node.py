@@ -14,9 +14,9 @@ from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.errors import InputError
 from pipeprog_frames.ring import Frame, FrameRing
 from pipeprog_frames.selector import Decision, FrameSelector
 from pipeprog_frames.tracker import GrayImage, reduction

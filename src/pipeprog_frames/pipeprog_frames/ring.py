@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from dataclasses import dataclass
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.tracker import MIN_CORNERS, GrayImage, Track, Tracker, corners, sharpness
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 
 GrayImage = NDArray[np.uint8]
 PointArray = NDArray[np.float32]

@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path
-from pipeprog_msgs import msg, srv
-from pipeprog_node.diagnostics import Diagnostics
-from pipeprog_node.main import run
-from pipeprog_node.parameters import declare
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 
-from pipeprog_frames.camera import Camera
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
+from pipeprog_msgs import msg, srv
 from pipeprog_node import messages, qos
+from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.main import run
+from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.board import load_boards
 from pipeprog_sfm.config import SfmConfig

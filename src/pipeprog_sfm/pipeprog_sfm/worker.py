@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-from pipeprog_frames.camera import Camera
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_sfm.board import Board
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import FrameTie

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeprog_camera.camera import Camera
 from pipeprog_detect.pipe import Cylinder, View
-from pipeprog_frames.camera import Camera
 
 WALL_DEPTH = 0.12
 SAMPLES = 2

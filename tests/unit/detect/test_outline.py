@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeprog_camera.camera import Camera
 from pipeprog_detect.outline import frame, moved, outline, project, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, View
-from pipeprog_frames.camera import Camera
 
 CAMERA = Camera(1280, 720, 914.0, 910.0, 640.2, 358.7)
 BLANK = np.zeros((720, 1280), np.uint8)

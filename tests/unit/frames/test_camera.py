@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeprog_frames.camera import Camera
-from pipeprog_frames.errors import InputError
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 
 K = [[900.0, 0, 639.5], [0, 905.0, 359.5], [0, 0, 1]]
 

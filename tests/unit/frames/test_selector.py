@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.selector import Decision, FrameSelector
 from pipeprog_frames.tracker import Tracker, reduction
