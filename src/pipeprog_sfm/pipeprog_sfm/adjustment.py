@@ -1,0 +1,298 @@
+"""Bundle adjustment of calibrated views: Levenberg-Marquardt on the Schur complement of the points.
+
+Own code rather than the solver that pycolmap wraps: that one wants the map as one Python object per observation, holds
+Python's lock while it works, and is several times slower on problems of this size.
+Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LOSS_SCALE = 1.0  # px, of the Cauchy loss: about twice the noise of a SIFT keypoint
+DENSE_VIEWS = 150  # up to this many free views a dense factorisation is the faster one
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Poses (C, 3, 3) and (C, 3), points (P, 3), and the cost before and after."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    points: FloatArray
+    initial_cost: float
+    cost: float
+    iterations: int
+
+
+def adjust(
+    rotation: FloatArray,
+    translation: FloatArray,
+    free: NDArray[np.bool_],
+    points: FloatArray,
+    start: IntArray,
+    view: IntArray,
+    rays: FloatArray,
+    focal: FloatArray,
+    *,
+    max_iterations: int,
+    tolerance: float,
+) -> Adjusted:
+    """Minimises Cauchy-robust reprojection errors over points and free views.
+
+    rotation (C, 3, 3), translation (C, 3): camera_from_world; free (C,): views that may move.
+    points (P, 3); observations sorted by point, those of point p in start[p]:start[p + 1], as view (K,) and
+    rays (K, 2), normalised image coordinates; focal (C, 2) px. Ends when an iteration gains less than `tolerance` of
+    the cost.
+    """
+    index = np.where(free, np.cumsum(free) - 1, -1)
+    count = int(free.sum())
+    pairs, pair_row, pair_column = _pairs(start, view, index, count)
+    rotation, translation, points = rotation.copy(), translation.copy(), points.copy()
+    cost = initial = _cost(rotation, translation, points, start, view, rays, focal)
+    damping = 1e-4
+    iteration = 0
+    while iteration < max_iterations:
+        iteration += 1
+        u, gc, v, gp, w = _linearise(rotation, translation, points, start, view, index, rays, focal, count)
+        gained = 0.0
+        for _ in range(6):
+            blocks, gradient, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(pair_row), damping)
+            step = _solve(blocks, pair_row, pair_column, gradient)
+            moves = _back_substitute(step.reshape(-1, 6), gp, w, v_inverse, start, view, index)
+            new_rotation, new_translation = _move(rotation, translation, index, step.reshape(-1, 6))
+            new_points = points + moves
+            new_cost = _cost(new_rotation, new_translation, new_points, start, view, rays, focal)
+            if new_cost < cost:
+                gained = cost - new_cost
+                rotation, translation, points, cost = new_rotation, new_translation, new_points, new_cost
+                damping = max(damping * 0.1, 1e-9)
+                break
+            damping *= 10
+        if gained <= tolerance * cost:
+            break
+    return Adjusted(rotation, translation, points, initial, cost, iteration)
+
+
+def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatArray) -> FloatArray:
+    """Solves the symmetric system given by its upper (6, 6) blocks."""
+    count = len(gradient)
+    if not count:
+        return np.zeros(0)
+    if count <= DENSE_VIEWS:
+        dense = np.zeros((count, 6, count, 6))
+        dense[row, :, column, :] = blocks
+        matrix = dense.reshape(6 * count, 6 * count)
+        factor = scipy.linalg.cho_factor(matrix, lower=False, overwrite_a=True, check_finite=False)
+        return scipy.linalg.cho_solve(factor, gradient.ravel(), check_finite=False)
+    off = row != column
+    data = np.concatenate([blocks, blocks[off].transpose(0, 2, 1)])
+    rows, columns = np.concatenate([row, column[off]]), np.concatenate([column, row[off]])
+    six = np.arange(6)
+    i = np.broadcast_to(6 * rows[:, None, None] + six[None, :, None], data.shape).ravel()
+    j = np.broadcast_to(6 * columns[:, None, None] + six[None, None, :], data.shape).ravel()
+    sparse = scipy.sparse.csc_matrix((data.ravel(), (i, j)), shape=(6 * count, 6 * count))
+    solver = scipy.sparse.linalg.splu(
+        sparse, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return solver.solve(gradient.ravel())
+
+
+def _move(
+    rotation: FloatArray, translation: FloatArray, index: IntArray, step: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    moved = np.flatnonzero(index >= 0)
+    new_rotation, new_translation = rotation.copy(), translation.copy()
+    if len(moved):
+        new_rotation[moved] = rotation_from_vector(step[index[moved], :3]) @ rotation[moved]
+        new_translation[moved] += step[index[moved], 3:]
+    return new_rotation, new_translation
+
+
+def rotation_from_vector(vectors: FloatArray) -> FloatArray:
+    """(N, 3) rotation vectors in radians -> (N, 3, 3) matrices (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    half = np.sinc(angle / (2 * np.pi))
+    return np.eye(3) + np.sinc(angle / np.pi) * skew + 0.5 * half * half * (skew @ skew)
+
+
+@njit(cache=True, nogil=True)
+def _pairs(start, view, index, count):  # type: ignore[no-untyped-def]  # compiled
+    """Number of each pair of free views that see a common point, and the pairs in order."""
+    pairs = np.full((count, count), -1, np.int32)
+    for c in range(count):
+        pairs[c, c] = 0
+    for p in range(len(start) - 1):
+        for k in range(start[p], start[p + 1]):
+            a = index[view[k]]
+            if a < 0:
+                continue
+            for m in range(k + 1, start[p + 1]):
+                b = index[view[m]]
+                if b >= 0:
+                    pairs[min(a, b), max(a, b)] = 0
+    total = 0
+    for a in range(count):
+        for b in range(a, count):
+            if pairs[a, b] == 0:
+                pairs[a, b] = total
+                total += 1
+    row = np.empty(total, np.int64)
+    column = np.empty(total, np.int64)
+    for a in range(count):
+        for b in range(a, count):
+            if pairs[a, b] >= 0:
+                row[pairs[a, b]] = a
+                column[pairs[a, b]] = b
+    return pairs, row, column
+
+
+@njit(cache=True, nogil=True)
+def _cost(rotation, translation, points, start, view, rays, focal):  # type: ignore[no-untyped-def]  # compiled
+    total = 0.0
+    scale = LOSS_SCALE * LOSS_SCALE
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        for k in range(start[p], start[p + 1]):
+            c = view[k]
+            r = rotation[c]
+            depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + translation[c, 2]
+            if depth <= 1e-9:
+                total += 0.5 * scale * 20.0  # a point behind a camera costs as much as a gross error
+                continue
+            eu = focal[c, 0] * ((r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + translation[c, 0]) / depth - rays[k, 0])
+            ev = focal[c, 1] * ((r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + translation[c, 1]) / depth - rays[k, 1])
+            total += 0.5 * scale * np.log1p((eu * eu + ev * ev) / scale)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _linearise(rotation, translation, points, start, view, index, rays, focal, count):  # type: ignore[no-untyped-def]  # compiled
+    """Blocks of the weighted normal equations; gradients are those of the descent direction."""
+    u = np.zeros((count, 6, 6))
+    gc = np.zeros((count, 6))
+    v = np.zeros((len(points), 3, 3))
+    gp = np.zeros((len(points), 3))
+    w = np.zeros((len(view), 6, 3))
+    jc = np.empty((2, 6))
+    jp = np.empty((2, 3))
+    residual = np.empty(2)
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        for k in range(start[p], start[p + 1]):
+            c = view[k]
+            r = rotation[c]
+            rx = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z
+            ry = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z
+            rz = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z
+            depth = rz + translation[c, 2]
+            if depth <= 1e-9:
+                continue
+            inverse = 1.0 / depth
+            a = (rx + translation[c, 0]) * inverse
+            b = (ry + translation[c, 1]) * inverse
+            residual[0] = focal[c, 0] * (a - rays[k, 0])
+            residual[1] = focal[c, 1] * (b - rays[k, 1])
+            square = residual[0] * residual[0] + residual[1] * residual[1]
+            weight = 1.0 / (1.0 + square / (LOSS_SCALE * LOSS_SCALE))
+            fu, fv = focal[c, 0] * inverse, focal[c, 1] * inverse
+            for i in range(3):
+                jp[0, i] = fu * (r[0, i] - a * r[2, i])
+                jp[1, i] = fv * (r[1, i] - b * r[2, i])
+            for i in range(3):
+                for j in range(3):
+                    v[p, i, j] += weight * (jp[0, i] * jp[0, j] + jp[1, i] * jp[1, j])
+                gp[p, i] -= weight * (jp[0, i] * residual[0] + jp[1, i] * residual[1])
+            n = index[c]
+            if n < 0:
+                continue
+            # d(R X)/d(rotation) = -[R X]x, d/d(translation) = I
+            jc[0, 0], jc[0, 1], jc[0, 2] = fu * (-a * ry), fu * (rz + a * rx), fu * (-ry)
+            jc[1, 0], jc[1, 1], jc[1, 2] = fv * (-rz - b * ry), fv * (b * rx), fv * rx
+            jc[0, 3], jc[0, 4], jc[0, 5] = fu, 0.0, -fu * a
+            jc[1, 3], jc[1, 4], jc[1, 5] = 0.0, fv, -fv * b
+            for i in range(6):
+                for j in range(6):
+                    u[n, i, j] += weight * (jc[0, i] * jc[0, j] + jc[1, i] * jc[1, j])
+                for j in range(3):
+                    w[k, i, j] = weight * (jc[0, i] * jp[0, j] + jc[1, i] * jp[1, j])
+                gc[n, i] -= weight * (jc[0, i] * residual[0] + jc[1, i] * residual[1])
+    return u, gc, v, gp, w
+
+
+@njit(cache=True, nogil=True)
+def _reduce(u, gc, v, gp, w, start, view, index, pairs, total, damping):  # type: ignore[no-untyped-def]  # compiled
+    blocks = np.zeros((total, 6, 6))
+    gradient = gc.copy()
+    v_inverse = np.zeros_like(v)
+    y = np.empty((6, 3))
+    for c in range(len(u)):
+        block = blocks[pairs[c, c]]
+        for i in range(6):
+            for j in range(6):
+                block[i, j] = u[c, i, j]
+            block[i, i] += damping * u[c, i, i] + 1e-9
+    for p in range(len(v)):
+        a00 = v[p, 0, 0] * (1 + damping) + 1e-12
+        a11 = v[p, 1, 1] * (1 + damping) + 1e-12
+        a22 = v[p, 2, 2] * (1 + damping) + 1e-12
+        a01, a02, a12 = v[p, 0, 1], v[p, 0, 2], v[p, 1, 2]
+        c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+        determinant = a00 * c00 + a01 * c01 + a02 * c02
+        if determinant <= 0:
+            continue
+        s = 1.0 / determinant
+        inverse = v_inverse[p]
+        inverse[0, 0], inverse[0, 1], inverse[0, 2] = c00 * s, c01 * s, c02 * s
+        inverse[1, 1], inverse[1, 2] = (a00 * a22 - a02 * a02) * s, (a01 * a02 - a00 * a12) * s
+        inverse[2, 2] = (a00 * a11 - a01 * a01) * s
+        inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
+        for k in range(start[p], start[p + 1]):
+            a = index[view[k]]
+            if a < 0:
+                continue
+            for i in range(6):
+                for j in range(3):
+                    y[i, j] = w[k, i, 0] * inverse[0, j] + w[k, i, 1] * inverse[1, j] + w[k, i, 2] * inverse[2, j]
+                gradient[a, i] -= y[i, 0] * gp[p, 0] + y[i, 1] * gp[p, 1] + y[i, 2] * gp[p, 2]
+            for m in range(start[p], start[p + 1]):
+                b = index[view[m]]
+                if b < a:
+                    continue
+                block = blocks[pairs[a, b]]
+                for i in range(6):
+                    for j in range(6):
+                        block[i, j] -= y[i, 0] * w[m, j, 0] + y[i, 1] * w[m, j, 1] + y[i, 2] * w[m, j, 2]
+    return blocks, gradient, v_inverse
+
+
+@njit(cache=True, nogil=True)
+def _back_substitute(step, gp, w, v_inverse, start, view, index):  # type: ignore[no-untyped-def]  # compiled
+    moves = np.empty_like(gp)
+    g = np.empty(3)
+    for p in range(len(gp)):
+        for j in range(3):
+            g[j] = gp[p, j]
+        for k in range(start[p], start[p + 1]):
+            a = index[view[k]]
+            if a < 0:
+                continue
+            for i in range(6):
+                for j in range(3):
+                    g[j] -= w[k, i, j] * step[a, i]
+        for i in range(3):
+            moves[p, i] = v_inverse[p, i, 0] * g[0] + v_inverse[p, i, 1] * g[1] + v_inverse[p, i, 2] * g[2]
+    return moves

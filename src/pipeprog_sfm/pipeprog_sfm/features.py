@@ -1,0 +1,64 @@
+"""Local features of a keyframe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.config import MapperConfig
+
+CONTRAST = 0.02  # a third of it per scale layer is the usual SIFT peak threshold of 0.0067
+TILES = (16, 9)  # the strongest of each tile come first, so that a thinly textured part of the image is heard
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one keyframe, strongest and best spread first.
+
+    keypoints: (N, 2) float32 pixels of the ideal pinhole image (pixel centres at integers).
+    descriptors: (N, 128) uint8, square roots of L1-normalised SIFT: 512 times a unit vector.
+    """
+
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Features:
+    """Features of a (H, W) uint8 image; keypoints are undistorted by the camera's lens model.
+
+    RootSIFT (Arandjelovic and Zisserman, CVPR 2012).
+    """
+    sift = cv2.SIFT_create(nfeatures=2 * config.max_features, contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    found, descriptors = sift.detectAndCompute(gray, None)
+    if not found:
+        return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8))
+    pixels = np.array([keypoint.pt for keypoint in found], np.float32)
+    response = np.array([keypoint.response for keypoint in found])
+    chosen = _spread(pixels, response, gray.shape)[: config.max_features]
+    keypoints = camera.undistort_points(pixels[chosen]).astype(np.float32)
+    return Features(keypoints, root_sift(descriptors[chosen]))
+
+
+def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(N, 128) SIFT descriptors -> (N, 128) uint8 with Euclidean norm 512."""
+    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
+    return np.minimum(np.rint(512 * np.sqrt(descriptors / total)), 255).astype(np.uint8)
+
+
+def _spread(pixels: NDArray[np.float32], response: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """Order by rank within the tile, then by response."""
+    column = np.minimum(pixels[:, 0] * TILES[0] // shape[1], TILES[0] - 1)
+    row = np.minimum(pixels[:, 1] * TILES[1] // shape[0], TILES[1] - 1)
+    tile = row * TILES[0] + column
+    order = np.lexsort((pixels[:, 1], pixels[:, 0], -response, tile))
+    first = np.searchsorted(tile[order], tile[order], side="left")
+    rank = np.empty(len(order), np.intp)
+    rank[order] = np.arange(len(order)) - first
+    return np.lexsort((pixels[:, 1], pixels[:, 0], -response, rank))

@@ -1,0 +1,422 @@
+"""Streaming structure from motion: keyframes in, poses and points of one map out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.colmap import absolute_pose, relative_pose
+from pipeprog_sfm.config import MapperConfig
+from pipeprog_sfm.features import Features, extract
+from pipeprog_sfm.matching import MatchArray, match, match_guided
+from pipeprog_sfm.model import SparseModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+COARSE = 1500  # strongest features that are matched without a prediction: enough for a pose, a seventh of the cost
+POSE_ERROR = 4.0  # px, for RANSAC: the map's points move by a pixel or two before they are adjusted
+MIN_INLIERS = 20  # of a pose: far above what chance gives at this error
+START_POINTS = 40  # of a new model
+START_ANGLE = np.radians(3.0)  # median between the rays of its points
+GUIDED_RADIUS = 4.0  # px around the epipolar segment
+TEMPORAL = 3  # neighbours in time that every keyframe is matched with
+COVISIBLE = 5  # further views by predicted overlap
+LOCAL_WINDOW = 8  # views that local bundle adjustment moves
+GROWTH = 1.3  # in views, between two global adjustments
+RETRIES = 3  # waiting keyframes tried again with each new one
+START_CANDIDATES = 8  # waiting keyframes that a new one may start a model with
+GRID = (32, 18)
+
+
+@dataclass(frozen=True)
+class KeyframeReport:
+    """What became of a keyframe: inliers of its pose, mean reprojection error in px; reason when not registered."""
+
+    stamp: int
+    registered: bool
+    reason: str
+    inliers: int
+    reprojection_error: float
+
+
+@dataclass(frozen=True)
+class FrameTie:
+    """Overlap of a keyframe with the map: Eq. 1 of the paper (hull areas) and the share of 32 x 18 cells."""
+
+    stamp: int
+    registered: bool
+    overlap: float
+    cell_overlap: float
+    tie_points: int
+    features: int
+    matches_previous: int
+    matches_next: int
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """points_in_model (N, 3) float64, views that see each (N,) int64, mean reprojection error (N,) in px."""
+
+    points_in_model: FloatArray
+    track_length: IntArray
+    error: FloatArray
+
+
+@dataclass(frozen=True)
+class _Keyframe:
+    stamp: int
+    features: Features
+    camera: Camera
+    rays: FloatArray
+    focal: FloatArray
+
+
+class Mapper:
+    """Registers each keyframe as it comes; the published model is the largest connected one."""
+
+    def __init__(self, config: MapperConfig, seed: int = 0) -> None:
+        self._config = config
+        self._seed = seed
+        self._keyframes: dict[int, _Keyframe] = {}
+        self._waiting: list[int] = []
+        self._models: list[SparseModel] = []
+        self._adjusted: dict[int, int] = {}
+        self._tied: dict[int, FrameTie] = {}
+
+    @property
+    def seen(self) -> int:
+        """Keyframes given so far."""
+        return len(self._keyframes)
+
+    @property
+    def waiting(self) -> int:
+        """Keyframes without a pose."""
+        return len(self._waiting)
+
+    @property
+    def models(self) -> int:
+        """Unconnected models."""
+        return len(self._models)
+
+    @property
+    def reprojection_error(self) -> float:
+        """Mean over the published model's observations, px; 0 without a model."""
+        if not self._models:
+            return 0.0
+        model = self._published
+        features = np.flatnonzero(model.point_of >= 0)
+        return float(model.errors(features).mean()) if len(features) else 0.0
+
+    @property
+    def _published(self) -> SparseModel:
+        return max(self._models, key=len)
+
+    def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera) -> KeyframeReport:
+        """Takes a keyframe: (H, W) uint8 as the camera saw it, stamp in ns."""
+        return self.add_features(stamp, extract(gray, camera, self._config), camera)
+
+    def add_features(self, stamp: int, features: Features, camera: Camera) -> KeyframeReport:
+        """Takes a keyframe whose features are known."""
+        rays = (features.keypoints - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        keyframe = _Keyframe(stamp, features, camera, rays, np.array([camera.fx, camera.fy]))
+        self._keyframes[stamp] = keyframe
+        report = self._register_anywhere(keyframe)
+        if report.registered:
+            self._retry(stamp)
+            return report
+        self._waiting.append(stamp)
+        if self._start(keyframe):
+            self._retry(stamp)
+            model = next(model for model in self._models if stamp in model.stamps)
+            view = model.stamps.index(stamp)
+            return self._registered(model, view)
+        return report
+
+    def finish(self) -> None:
+        """Tries the waiting keyframes once more and adjusts everything."""
+        for model in self._models:
+            self._adjust_globally(model)
+        while self._waiting:
+            before = len(self._waiting)
+            for stamp in list(self._waiting):
+                if self._register_anywhere(self._keyframes[stamp]).registered:
+                    self._waiting.remove(stamp)
+            if len(self._waiting) == before:
+                break
+        for model in self._models:
+            self._complete(model)
+            self._adjust_globally(model)
+
+    def camera_from_model(self) -> dict[int, FloatArray]:
+        """Poses (4, 4) of the published model's keyframes, in order of time."""
+        if not self._models:
+            return {}
+        model = self._published
+        return {model.stamps[view]: model.pose(view) for view in np.argsort(model.stamps, kind="stable")}
+
+    def points(self) -> SparsePoints:
+        """The published model's points."""
+        if not self._models:
+            return SparsePoints(np.empty((0, 3)), np.empty(0, np.int64), np.empty(0))
+        model = self._published
+        ids, start, features = model.observations(np.ones(len(model.points), bool))
+        length = np.diff(start)
+        error = np.add.reduceat(model.errors(features), start[:-1]) / length if len(ids) else np.empty(0)
+        return SparsePoints(model.points[ids], length, error)
+
+    def observations(self, stamp: int) -> tuple[IntArray, FloatArray]:
+        """Indices into points() and (K, 2) pixels of what a keyframe of the published model sees."""
+        model = self._published
+        alive = np.zeros(len(model.points), bool)
+        alive[model.point_of[model.point_of >= 0]] = True
+        number = np.cumsum(alive) - 1
+        own = model.point_of[model.features(model.stamps.index(stamp))]
+        seen = own >= 0
+        return number[own[seen]], self._keyframes[stamp].features.keypoints[seen].astype(np.float64)
+
+    def neighbours(self, stamp: int) -> list[tuple[int, int]]:
+        """(stamp, shared points) of the published model's keyframes that share points, most first."""
+        model = self._published
+        shared = model.covisible(model.stamps.index(stamp))
+        order = np.argsort(-shared, kind="stable")
+        return [(model.stamps[view], int(shared[view])) for view in order if shared[view] > 0]
+
+    def ties(self) -> list[FrameTie]:
+        """Overlap of the keyframes for which it changed since the last call."""
+        changed = []
+        for stamp, tie in self._all_ties().items():
+            if self._tied.get(stamp) != tie:
+                changed.append(tie)
+                self._tied[stamp] = tie
+        return changed
+
+    def _all_ties(self) -> dict[int, FrameTie]:
+        ties = {}
+        model = self._published if self._models else SparseModel()
+        view_of_stamp = {stamp: view for view, stamp in enumerate(model.stamps)}
+        previous: set[int] = set()
+        stamps = sorted(self._keyframes)
+        seen_points = {
+            stamp: model.point_of[model.features(view_of_stamp[stamp])] if stamp in view_of_stamp else np.empty(0, int)
+            for stamp in stamps
+        }
+        del previous
+        shared = [
+            len(np.intersect1d(seen_points[a][seen_points[a] >= 0], seen_points[b][seen_points[b] >= 0]))
+            for a, b in zip(stamps[:-1], stamps[1:], strict=True)
+        ]
+        for n, stamp in enumerate(stamps):
+            keyframe = self._keyframes[stamp]
+            keypoints = keyframe.features.keypoints
+            tied = seen_points[stamp] >= 0
+            size = (keyframe.camera.width, keyframe.camera.height)
+            inside = keypoints[tied] if len(tied) else keypoints[:0]
+            ties[stamp] = FrameTie(
+                stamp,
+                stamp in view_of_stamp,
+                _hull(inside) / max(_hull(keypoints), 1e-9),
+                _cells(inside, size) / max(_cells(keypoints, size), 1),
+                len(inside),
+                len(keypoints),
+                shared[n - 1] if n else 0,
+                shared[n] if n < len(shared) else 0,
+            )
+        return ties
+
+    def _register_anywhere(self, keyframe: _Keyframe) -> KeyframeReport:
+        report = KeyframeReport(keyframe.stamp, False, "no model has been started yet", 0, 0.0)
+        for model in sorted(self._models, key=lambda model: abs(_nearest(model, keyframe.stamp) - keyframe.stamp)):
+            report = self._register(model, keyframe)
+            if report.registered:
+                break
+        return report
+
+    def _register(self, model: SparseModel, keyframe: _Keyframe) -> KeyframeReport:
+        """Pose from the map points that the neighbours in time see; then matches, tracks and local adjustment."""
+        order = np.argsort(np.abs(np.array(model.stamps) - keyframe.stamp), kind="stable")[:2]
+        features, others = [], []
+        for view in order:
+            other = self._keyframes[model.stamps[view]]
+            found = match(keyframe.features.descriptors[:COARSE], other.features.descriptors[:COARSE])
+            features.append(found[:, 0].astype(np.int64))
+            others.append(found[:, 1] + model.offsets[view])
+        feature, other_feature = np.concatenate(features), np.concatenate(others)
+        point = model.point_of[other_feature]
+        known = point >= 0
+        pairs = np.unique(np.stack([feature[known], point[known]], axis=1), axis=0)
+        pose = absolute_pose(
+            keyframe.features.keypoints[pairs[:, 0]], model.points[pairs[:, 1]], keyframe.camera, POSE_ERROR, self._seed
+        )
+        inliers = 0 if pose is None else int(pose.inliers.sum())
+        if pose is None or inliers < MIN_INLIERS:
+            reason = f"only {inliers} of {len(pairs)} matches with the map agree on a pose"
+            return KeyframeReport(keyframe.stamp, False, reason, inliers, 0.0)
+        view = model.add_view(keyframe.stamp, keyframe.rays, keyframe.focal, pose.camera_from_model)
+        used = pairs[pose.inliers]
+        first = np.unique(used[:, 0], return_index=True)[1]
+        model.point_of[model.offsets[view] + used[first, 0]] = used[first, 1]
+        self._link(model, view)
+        self._adjust_locally(model, view)
+        if len(model) >= GROWTH * self._adjusted.get(id(model), 2):
+            self._adjust_globally(model)
+        return self._registered(model, view)
+
+    def _registered(self, model: SparseModel, view: int) -> KeyframeReport:
+        own = np.arange(model.offsets[view], model.offsets[view + 1])
+        own = own[model.point_of[own] >= 0]
+        error = float(model.errors(own).mean()) if len(own) else 0.0
+        return KeyframeReport(model.stamps[view], True, "", len(own), error)
+
+    def _link(self, model: SparseModel, view: int) -> None:
+        """Matches a view with its neighbours in time and with those that look at the same place, guided by the poses."""
+        own = model.point_of[model.features(view)]
+        depth = model.points[own[own >= 0]] @ model.rotation[view, 2] + model.translation[view, 2]
+        depth = depth[depth > 0]
+        if not len(depth):
+            return
+        near, far = 0.5 * np.percentile(depth, 2), 2.0 * np.percentile(depth, 98)
+        features, others = [], []
+        for other in self._partners(model, view, own[own >= 0]):
+            found = self._match_guided(model, view, other, float(near), float(far))
+            features.append(found[:, 0] + model.offsets[view])
+            others.append(found[:, 1] + model.offsets[other])
+        if not features:
+            return
+        feature, other_feature = np.concatenate(features).astype(np.int64), np.concatenate(others).astype(np.int64)
+        order = np.lexsort((other_feature, feature))
+        model.link(view, feature[order], other_feature[order])
+
+    def _partners(self, model: SparseModel, view: int, seen: IntArray) -> list[int]:
+        """Neighbours in time, then the views into which most of the view's points project from a like direction."""
+        gap = np.abs(np.array(model.stamps) - model.stamps[view])
+        gap[view] = np.iinfo(np.int64).max
+        temporal = [int(other) for other in np.argsort(gap, kind="stable")[:TEMPORAL] if other != view]
+        sample = model.points[seen[:: max(len(seen) // 200, 1)]]
+        inside = np.einsum("vij,pj->vpi", model.rotation, sample) + model.translation[:, None]
+        depth = inside[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = inside[..., 0] / depth, inside[..., 1] / depth
+        camera = self._keyframes[model.stamps[view]].camera
+        visible = (depth > 0) & (np.abs(u) < 0.5 * camera.width / camera.fx)
+        visible &= np.abs(v) < 0.5 * camera.height / camera.fy
+        # SIFT finds a patch again when it is seen from within some 40 degrees and at up to twice the scale.
+        own = depth[view]
+        visible &= (depth < 2 * own) & (2 * depth > own)
+        alike = model.rotation[:, 2] @ model.rotation[view, 2] > np.cos(np.radians(40))
+        score = np.where(alike, visible.mean(axis=1), 0.0)
+        score[[view, *temporal]] = 0.0
+        best = np.argsort(-score, kind="stable")[:COVISIBLE]
+        return temporal + [int(other) for other in best if score[other] > 0.3]
+
+    def _match_guided(self, model: SparseModel, view: int, other: int, near: float, far: float) -> MatchArray:
+        """Matches along the epipolar segment between two depths; a feature with a point is looked for at its place."""
+        mine = self._keyframes[model.stamps[view]]
+        theirs = self._keyframes[model.stamps[other]]
+        rotation = model.rotation[other] @ model.rotation[view].T
+        translation = model.translation[other] - rotation @ model.translation[view]
+        low = np.full(len(mine.rays), near)
+        high = np.full(len(mine.rays), far)
+        own = model.point_of[model.features(view)]
+        has = own >= 0
+        depth = model.points[own[has]] @ model.rotation[view, 2] + model.translation[view, 2]
+        low[has], high[has] = 0.95 * depth, 1.05 * depth
+        direction = np.c_[mine.rays, np.ones(len(mine.rays))] @ rotation.T
+        focal, centre = theirs.focal, np.array([theirs.camera.cx, theirs.camera.cy])
+        ends = []
+        for distance in (low, high):
+            inside = direction * distance[:, None] + translation
+            pixel = np.full((len(inside), 2), np.nan)
+            front = inside[:, 2] > 0.1 * distance
+            pixel[front] = inside[front, :2] / inside[front, 2:] * focal + centre
+            ends.append(pixel)
+        return match_guided(
+            mine.features.descriptors, ends[0], ends[1],
+            theirs.features.descriptors, theirs.features.keypoints, GUIDED_RADIUS,
+        )  # fmt: skip
+
+    def _start(self, keyframe: _Keyframe) -> bool:
+        """Starts a model from the new keyframe and the waiting one with which most points can be triangulated."""
+        best: SparseModel | None = None
+        for stamp in self._waiting[-START_CANDIDATES - 1 : -1]:
+            model = self._pair(self._keyframes[stamp], keyframe)
+            if model is not None and (best is None or _tracks(model) > _tracks(best)):
+                best = model
+        if best is None:
+            return False
+        self._models.append(best)
+        self._waiting = [stamp for stamp in self._waiting if stamp not in best.stamps]
+        return True
+
+    def _pair(self, first: _Keyframe, second: _Keyframe) -> SparseModel | None:
+        found = match(first.features.descriptors[:COARSE], second.features.descriptors[:COARSE])
+        if len(found) < START_POINTS:
+            return None
+        pixels, other_pixels = first.features.keypoints[found[:, 0]], second.features.keypoints[found[:, 1]]
+        pose = relative_pose(pixels, other_pixels, first.camera, second.camera, 0.5 * POSE_ERROR, self._seed)
+        if pose is None or pose.inliers.sum() < START_POINTS:
+            return None
+        model = SparseModel()
+        model.add_view(first.stamp, first.rays, first.focal, np.eye(4))
+        view = model.add_view(second.stamp, second.rays, second.focal, pose.b_from_a)
+        found = found[pose.inliers].astype(np.int64)
+        found = found[np.argsort(found[:, 1], kind="stable")]
+        model.link(view, found[:, 1] + model.offsets[1], found[:, 0])
+        model.adjust(None, 20, 1e-4)
+        self._link(model, view)
+        model.adjust(None, 20, 1e-4)
+        ids, start, features = model.observations(np.ones(len(model.points), bool))
+        if len(ids) < START_POINTS:
+            return None
+        rays = model.points[ids, None] - model.centres()[None]
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        angle = np.median(np.arccos(np.clip((rays[:, 0] * rays[:, 1]).sum(axis=1), -1, 1)))
+        return model if angle > START_ANGLE else None
+
+    def _retry(self, stamp: int) -> None:
+        """Tries the waiting keyframes nearest in time to a registered one."""
+        for waiting in sorted(self._waiting, key=lambda other: abs(other - stamp))[:RETRIES]:
+            if self._register_anywhere(self._keyframes[waiting]).registered:
+                self._waiting.remove(waiting)
+
+    def _adjust_locally(self, model: SparseModel, view: int) -> None:
+        shared = model.covisible(view)
+        window = np.argsort(-shared, kind="stable")[: LOCAL_WINDOW - 1]
+        window = np.append(window[shared[window] > 0], view)
+        if len(model) <= LOCAL_WINDOW:
+            model.adjust(None, 10, 1e-3)
+        else:
+            model.adjust(window, 10, 1e-3)
+
+    def _adjust_globally(self, model: SparseModel) -> None:
+        model.adjust(None, 30, 1e-4)
+        self._adjusted[id(model)] = len(model)
+
+    def _complete(self, model: SparseModel) -> None:
+        """Looks again for matches now that the poses are better."""
+        for view in range(len(model)):
+            self._link(model, view)
+
+
+def _tracks(model: SparseModel) -> int:
+    return int((model.point_of >= 0).sum())
+
+
+def _nearest(model: SparseModel, stamp: int) -> int:
+    return min(model.stamps, key=lambda other: abs(other - stamp))
+
+
+def _hull(pixels: NDArray[np.float32]) -> float:
+    """Area of the convex hull of (N, 2) pixels."""
+    return float(cv2.contourArea(cv2.convexHull(pixels))) if len(pixels) > 2 else 0.0
+
+
+def _cells(pixels: NDArray[np.float32], size: tuple[int, int]) -> int:
+    """Cells of a grid over the image that hold a pixel."""
+    column = (pixels[:, 0] * GRID[0] / size[0]).astype(int)
+    row = (pixels[:, 1] * GRID[1] / size[1]).astype(int)
+    return len(np.unique(row * GRID[0] + column))
