@@ -8,6 +8,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Path
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
@@ -59,7 +60,8 @@ class DetectNode(Node):
         self.create_subscription(PointCloud2, "map_points", self._on_map_part, qos.latched())
         self.create_subscription(Path, "keyframe_poses", self._on_map_part, qos.latched())
         self.create_subscription(msg.SfmStatus, "sfm_status", self._on_status, qos.latched())
-        self.create_service(srv.Finish, "~/finish", self._on_finish)
+        # In a group of its own: while it waits for the end, the other callbacks must run.
+        self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "pipes", self._health)
 
     def destroy_node(self) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -66,7 +67,8 @@ class FramesNode(Node):
         if self._config.image_transport != "compressed":
             subscribe(Image, "image", self._on_image)
         self.create_subscription(ImageOverlapArray, "image_overlap", self._on_overlap, qos.reliable(50))
-        self.create_service(Finish, "~/finish", self._on_finish)
+        # In a group of its own: while it waits for the end, the other callbacks must run.
+        self.create_service(Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "keyframes", self._health)
 
     def _on_camera_info(self, message: CameraInfo) -> None:

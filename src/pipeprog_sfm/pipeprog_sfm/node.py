@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
@@ -54,7 +55,8 @@ class SfmNode(Node):
             CompressedImage, "keyframes/image/compressed", self._on_image, qos.reliable(MAX_BACKLOG)
         )
         self.create_subscription(CameraInfo, "keyframes/camera_info", self._on_camera_info, qos.reliable(MAX_BACKLOG))
-        self.create_service(srv.Finish, "~/finish", self._on_finish)
+        # In a group of its own: while it waits for the end, the other callbacks must run.
+        self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
 
     def destroy_node(self) -> None:
