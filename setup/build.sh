@@ -19,4 +19,11 @@ if ! "$python" -m colcon --log-base "$venv/log" build \
     echo "The workspace did not build; the log of each package is in $venv/log/latest_build." >&2
     exit 1
 fi
-ln -sf ../lib/pipeprog_bringup/pipeprog "$venv/bin/pipeprog"
+# Not the script of the package's entry point: its first line cannot hold a path with a space.
+rm -f "$venv/bin/pipeprog"
+cat >"$venv/bin/pipeprog" <<'END'
+#!/bin/sh
+here=$(dirname -- "$(readlink -f -- "$0")")
+exec "$here/python" -c 'import sys; sys.argv[0] = "pipeprog"; from pipeprog_bringup.cli import main; main()' "$@"
+END
+chmod +x "$venv/bin/pipeprog"
