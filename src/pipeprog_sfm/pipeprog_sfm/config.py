@@ -46,7 +46,7 @@ class StereoConfig:
     """Depth maps."""
 
     max_pairs: int = field(
-        default=3,
+        default=4,
         metadata={"description": "neighbours that each keyframe is matched with", "unit": "", "range": (1, 8)},
     )
     width: int = field(

@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import StereoConfig
+from pipeprog_sfm.patches import refine
+from pipeprog_sfm.sweep import OVERSAMPLING, sweep
 
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
@@ -20,7 +22,10 @@ BASELINE_RATIO = (0.08, 0.35)  # of the depth; below, depth is noise; above, the
 BASELINE_RATIO_BEST = 0.2
 VIEW_ANGLE_MAX = np.radians(30.0)  # between optical axes: the images must overlap
 FORWARD_MAX = np.radians(50.0)  # baseline out of the image plane: towards 90 the epipole enters the image
-AGREEMENT = 0.01  # of the depth: two pairs that agree this well have seen the same surface
+STRIDE = OVERSAMPLING  # [px] of the working resolution: the sweep's neighbours are at that resolution
+SHADING = 4.0  # [px] of the working resolution
+CORRELATION_MIN = 0.5
+SIGMA_MAX = 0.005
 
 
 @dataclass(frozen=True)
@@ -90,21 +95,51 @@ def depth_map(
     depth_range: tuple[float, float],
     config: StereoConfig,
 ) -> DepthMap:
-    """Depth of the reference image at working resolution from its neighbours; depth_range = (near, far) of the scene."""
+    """Depth of every STRIDE-th pixel of the reference at working resolution; depth_range = (near, far) of the scene.
+
+    A semi-global sweep over all neighbours at reduced resolution finds the surface, patches at full working resolution
+    then place it to a fraction of a pixel.
+    """
     near, far = depth_range
+    if not 0.0 < near < far:
+        raise ValueError(f"depth range {near:g} to {far:g} is empty")
     image, camera = _at_working_resolution(reference, config)
-    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    depths = []
+    color = cv2.pyrDown(image)  # its pixel (u, v) is centred at (2 u, 2 v)
+    height, width = color.shape[:2]
+    grid = Camera(width, height, camera.fx / STRIDE, camera.fy / STRIDE, camera.cx / STRIDE, camera.cy / STRIDE)
+    if not neighbours:
+        return DepthMap(reference.stamp, np.full((height, width), np.nan, np.float32), grid, color)
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    others, homographies, epipoles = [], [], []
     for neighbour in neighbours:
         other, other_camera = _at_working_resolution(neighbour, config)
+        others.append(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY).astype(np.float32))
         other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
-        depths.append(
-            _pair_depth(
-                gray, camera, cv2.cvtColor(other, cv2.COLOR_BGR2GRAY), other_camera, other_from_reference, near, far
-            )
-        )
-    depth = _agreeing(np.stack(depths)) if depths else np.full(gray.shape, np.nan, np.float32)
-    return DepthMap(reference.stamp, depth, camera, image)
+        homographies.append(other_camera.matrix @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
+        epipoles.append(other_camera.matrix @ other_from_reference[:3, 3])
+    homography, epipole = np.stack(homographies), np.stack(epipoles)
+    inverse = sweep(
+        cv2.pyrDown(_without_shading(gray)),
+        np.stack([_low_pass(_without_shading(other)) for other in others]),
+        homography @ np.diag([STRIDE, STRIDE, 1.0]),
+        epipole,
+        (1.0 / far, 1.0 / near),
+    )
+    inverse, correlation, sigma = refine(inverse, gray, np.stack(others), homography, epipole, STRIDE)
+    known = (correlation >= CORRELATION_MIN) & (sigma <= SIGMA_MAX)
+    depth = np.where(known, 1.0 / np.where(known, inverse, 1.0), np.nan).astype(np.float32)
+    return DepthMap(reference.stamp, depth, grid, color)
+
+
+def _without_shading(gray: FloatImage) -> FloatImage:
+    """Only what is finer than SHADING: highlights and shades do not lie on the surface, and move with the camera."""
+    return gray - cv2.GaussianBlur(gray, (0, 0), SHADING)
+
+
+def _low_pass(image: FloatImage) -> FloatImage:
+    """The kernel of cv2.pyrDown, without its decimation."""
+    kernel = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
+    return cv2.sepFilter2D(image, -1, kernel, kernel)
 
 
 def _centre(camera_from_world: FloatArray) -> FloatArray:
@@ -117,72 +152,3 @@ def _at_working_resolution(view: StereoImage, config: StereoConfig) -> tuple[Byt
         return view.image, view.camera
     camera = view.camera.scaled(factor)
     return cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera
-
-
-def _pair_depth(
-    gray: ByteImage,
-    camera: Camera,
-    other: ByteImage,
-    other_camera: Camera,
-    other_from_reference: FloatArray,
-    near: float,
-    far: float,
-) -> FloatImage:
-    """Depth in the reference view by semi-global matching along the epipolar lines, NaN where unknown.
-
-    The pair is rectified with x along the baseline towards the neighbour, wherever that points in the image: so the
-    reference is always the left image, and vertical baselines or cameras on their side are nothing special.
-    """
-    rotation = other_from_reference[:3, :3]
-    baseline = -rotation.T @ other_from_reference[:3, 3]
-    length = float(np.linalg.norm(baseline))
-    x = baseline / length
-    z = np.array([0.0, 0.0, 1.0]) + rotation[2]
-    z -= x * (z @ x)
-    z /= np.linalg.norm(z)
-    rectified_from_reference = np.stack([x, np.cross(z, x), z])
-    rectified_from_other = rectified_from_reference @ rotation.T
-    focal = camera.fx
-    corners = np.array(
-        [
-            [-0.5, -0.5],
-            [camera.width - 0.5, -0.5],
-            [camera.width - 0.5, camera.height - 0.5],
-            [-0.5, camera.height - 0.5],
-        ]
-    )
-    rays = rectified_from_reference @ np.linalg.inv(camera.matrix) @ np.c_[corners, np.ones(4)].T
-    low, high = np.floor((rays[:2] / rays[2]).min(axis=1) * focal), np.ceil((rays[:2] / rays[2]).max(axis=1) * focal)
-    width, height = (high - low).astype(int)
-    rectified_k = np.array([[focal, 0.0, -low[0]], [0.0, focal, -low[1]], [0.0, 0.0, 1.0]])
-    least = int(np.floor(focal * length / far))
-    count = -(-int(np.ceil(focal * length / near) - least) // 16) * 16
-    left_warp = rectified_k @ rectified_from_reference @ np.linalg.inv(camera.matrix)
-    shift = np.array([[1.0, 0.0, least], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    right_warp = shift @ rectified_k @ rectified_from_other @ np.linalg.inv(other_camera.matrix)
-    left = cv2.warpPerspective(gray, left_warp, (width, height))
-    right = cv2.warpPerspective(other, right_warp, (width, height))
-    block = 5
-    matcher = cv2.StereoSGBM.create(
-        0, count, block, 2 * block**2, 8 * block**2, 1, 31, 5, 50, 2, cv2.STEREO_SGBM_MODE_SGBM_3WAY
-    )
-    pad = ((0, 0), (count, 0))  # the matcher leaves out the first `count` columns
-    disparity = matcher.compute(np.pad(left, pad), np.pad(right, pad))[:, count:].astype(np.float32) / 16.0
-    disparity[disparity < 0] = np.nan
-    rows, columns = np.indices(gray.shape, np.float32)
-    mapped = cv2.perspectiveTransform(np.stack([columns, rows], -1), left_warp)
-    found = cv2.remap(disparity, mapped, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan)
-    ray = np.stack([(mapped[..., 0] + low[0]) / focal, (mapped[..., 1] + low[1]) / focal, np.ones_like(found)], -1)
-    return (focal * length / (found + least) * (ray @ rectified_from_reference[:, 2])).astype(np.float32)
-
-
-def _agreeing(depths: FloatImage) -> FloatImage:
-    """(pairs, h, w) -> (h, w): mean of the depths that agree with most others; of one pair alone only if there is one."""
-    if len(depths) == 1:
-        return depths[0]
-    support = np.stack([(np.abs(depths - depth) < AGREEMENT * depth).sum(axis=0) for depth in depths])
-    best = np.take_along_axis(depths, support.argmax(axis=0)[None], axis=0)
-    agree = np.abs(depths - best) < AGREEMENT * best
-    total = np.where(agree, depths, 0.0).sum(axis=0)
-    count = agree.sum(axis=0)
-    return np.where(count >= 2, total / np.maximum(count, 1), np.nan).astype(np.float32)

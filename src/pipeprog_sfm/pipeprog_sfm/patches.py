@@ -1,0 +1,228 @@
+"""Sub-pixel depth: small slanted patches, compared in all neighbours at once and moved until they match.
+
+Propagation of planes between pixels follows Bleyer, Rhemann and Rother, "PatchMatch stereo", 2011; the step to the
+best match is Gauss-Newton on the zero-mean differences, as in Furukawa and Ponce's patches, 2010.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+RADIUS = 2  # of a patch [px]: 5 x 5, smaller than the thinnest pipe at working distance
+SIZE = (2 * RADIUS + 1) ** 2
+PLANE_RADIUS = 2  # grid pixels around one whose inverse depths give its slant
+SAME_SURFACE = 0.01  # relative difference of depth up to which neighbouring pixels lie on one surface
+CORRELATION_MIN = 0.3  # below, a view does not see the patch
+STEP_MAX = 0.004  # of the depth: linearisation of an image holds for about a pixel
+GAIN_MIN, GAIN_MAX = 0.7, 1.4  # of one view's contrast over another's: exposure, viewing angle
+NOISE = 0.7  # [grey levels] of two 8-bit images' difference at best
+ROUNDS = (1, 2, 0)  # distance in grid pixels at which each round takes over planes; 0: none
+
+
+def refine(
+    inverse_depth: NDArray[np.float32],
+    image: NDArray[np.float32],
+    neighbours: NDArray[np.float32],
+    homographies: NDArray[np.float64],
+    epipoles: NDArray[np.float64],
+    stride: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Inverse depth on a grid of every `stride`-th pixel of `image`, improved; its correlation; its relative sigma.
+
+    A pixel (u, v) of inverse depth i lies at homographies[n] @ (u, v, 1) + i * epipoles[n] of neighbour n (N, h, w).
+    The correlation is the mean of the better half of the views, so that an occluded side does no harm; sigma follows
+    from the patches' gradients and residuals. All outputs have the grid's shape; inverse depth NaN where unknown.
+    """
+    homographies, epipoles = homographies.astype(np.float32), epipoles.astype(np.float32)
+    better_half = (len(neighbours) + 1) // 2
+    correlation = sigma = np.zeros_like(inverse_depth)
+    for distance in ROUNDS:
+        slant = _slants(inverse_depth, stride)
+        inverse_depth, correlation, sigma = _round(
+            inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride
+        )
+    return inverse_depth, correlation, sigma
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _slants(inverse_depth, stride):  # type: ignore[no-untyped-def]
+    """(h, w, 2) derivatives of inverse depth by the image's columns and rows: inverse depth is affine on a plane."""
+    height, width = inverse_depth.shape
+    slant = np.zeros((height, width, 2), np.float32)
+    for v in prange(height):
+        for u in range(width):
+            centre = inverse_depth[v, u]
+            if not centre > 0.0:
+                continue
+            n, su, sv, suu, suv, svv, sw, swu, swv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for i in range(max(0, v - PLANE_RADIUS), min(height, v + PLANE_RADIUS + 1)):
+                for j in range(max(0, u - PLANE_RADIUS), min(width, u + PLANE_RADIUS + 1)):
+                    w = inverse_depth[i, j] - centre
+                    if not abs(w) < SAME_SURFACE * centre:
+                        continue
+                    du, dv = float(j - u), float(i - v)
+                    n += 1.0
+                    su += du
+                    sv += dv
+                    suu += du * du
+                    suv += du * dv
+                    svv += dv * dv
+                    sw += w
+                    swu += w * du
+                    swv += w * dv
+            cuu, cuv, cvv = suu - su * su / n, suv - su * sv / n, svv - sv * sv / n
+            determinant = cuu * cvv - cuv * cuv
+            if n >= 6.0 and determinant > 1e-3 * cuu * cvv:
+                cwu, cwv = swu - sw * su / n, swv - sw * sv / n
+                slant[v, u, 0] = (cwu * cvv - cwv * cuv) / (determinant * stride)
+                slant[v, u, 1] = (cwv * cuu - cwu * cuv) / (determinant * stride)
+    return slant
+
+
+@njit(cache=True, parallel=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride):  # type: ignore[no-untyped-def]
+    """Takes over the plane of a grid neighbour where it matches better, then one Gauss-Newton step of the depth."""
+    height, width = inverse_depth.shape
+    out = np.full((height, width), np.nan, np.float32)
+    correlations = np.zeros((height, width), np.float32)
+    sigmas = np.full((height, width), np.inf, np.float32)
+    for index in prange(height):
+        row = np.int64(index)  # prange counts unsigned
+        v = row * stride
+        if v < RADIUS or v >= image.shape[0] - RADIUS:
+            continue
+        patch = np.empty(SIZE, np.float32)
+        warped = np.empty(SIZE, np.float32)
+        change = np.empty(SIZE, np.float32)
+        scores = np.empty(len(neighbours), np.float32)
+        for column in range(width):
+            u = column * stride
+            if u < RADIUS or u >= image.shape[1] - RADIUS or not inverse_depth[row, column] > 0.0:
+                continue
+            mean = np.float32(0.0)
+            for k in range(SIZE):
+                patch[k] = image[v + k // (2 * RADIUS + 1) - RADIUS, u + k % (2 * RADIUS + 1) - RADIUS]
+                mean += patch[k]
+            mean /= SIZE
+            energy = np.float32(0.0)
+            for k in range(SIZE):
+                patch[k] -= mean
+                energy += patch[k] * patch[k]
+            best_depth, best, best_step, best_sigma = (
+                np.float32(0.0),
+                np.float32(-2.0),
+                np.float32(0.0),
+                np.float32(0.0),
+            )
+            for candidate in range(5 if distance > 0 else 1):
+                i, j = row, column
+                if candidate == 1:
+                    j -= distance
+                elif candidate == 2:
+                    j += distance
+                elif candidate == 3:
+                    i -= distance
+                elif candidate == 4:
+                    i += distance
+                if i < 0 or i >= height or j < 0 or j >= width or not inverse_depth[i, j] > 0.0:
+                    continue
+                su, sv = slant[i, j, 0], slant[i, j, 1]
+                depth = inverse_depth[i, j] + (su * (column - j) + sv * (row - i)) * stride
+                if candidate > 0 and abs(depth - best_depth) < np.float32(0.0007) * depth:
+                    continue  # the same plane for all that one step can tell
+                score, step, sigma = _match(
+                    patch,
+                    energy,
+                    neighbours,
+                    homographies,
+                    epipoles,
+                    u,
+                    v,
+                    depth,
+                    su,
+                    sv,
+                    better_half,
+                    warped,
+                    change,
+                    scores,
+                )
+                if score > best:
+                    best_depth, best, best_step, best_sigma = depth, score, step, sigma
+            if best_sigma > 0.0:
+                limit = np.float32(STEP_MAX) * best_depth
+                out[row, column] = best_depth + min(max(best_step, -limit), limit)
+                correlations[row, column] = best
+                sigmas[row, column] = best_sigma / best_depth
+    return out, correlations, sigmas
+
+
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, warped, change, scores):  # type: ignore[no-untyped-def]
+    """Mean correlation over the better half of the views, Gauss-Newton step of the inverse depth, sigma (0: unseen)."""
+    one = np.float32(1.0)
+    gradient, curvature, residual, used = np.float32(0.0), np.float32(0.0), np.float32(0.0), 0
+    for n in range(len(neighbours)):
+        scores[n] = -1.0
+        image = neighbours[n]
+        h, e = homographies[n], epipoles[n]
+        z = one / (h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * depth)
+        x = (h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * depth) * z
+        y = (h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * depth) * z
+        # the plane-induced homography is affine over so small a patch
+        zu, zv = h[2, 0] + e[2] * su, h[2, 1] + e[2] * sv
+        xu, xv = (h[0, 0] + e[0] * su - x * zu) * z, (h[0, 1] + e[0] * sv - x * zv) * z
+        yu, yv = (h[1, 0] + e[1] * su - y * zu) * z, (h[1, 1] + e[1] * sv - y * zv) * z
+        dx, dy = (e[0] - e[2] * x) * z, (e[1] - e[2] * y) * z
+        reach_x, reach_y = RADIUS * (abs(xu) + abs(xv)), RADIUS * (abs(yu) + abs(yv))
+        inside = x - reach_x >= 0.0 and y - reach_y >= 0.0
+        if not (inside and x + reach_x < image.shape[1] - 1 and y + reach_y < image.shape[0] - 1):
+            continue
+        k = 0
+        mean, mean_change = np.float32(0.0), np.float32(0.0)
+        for i in range(-RADIUS, RADIUS + 1):
+            for j in range(-RADIUS, RADIUS + 1):
+                px, py = x + xu * j + xv * i, y + yu * j + yv * i
+                ix, iy = np.int32(px), np.int32(py)
+                fx, fy = px - np.float32(ix), py - np.float32(iy)
+                top_left, bottom_left = image[iy, ix], image[iy + 1, ix]
+                top_slope, bottom_slope = image[iy, ix + 1] - top_left, image[iy + 1, ix + 1] - bottom_left
+                top = top_left + top_slope * fx
+                fall = bottom_left + bottom_slope * fx - top
+                warped[k] = top + fall * fy
+                change[k] = (top_slope + (bottom_slope - top_slope) * fy) * dx + fall * dy
+                mean += warped[k]
+                mean_change += change[k]
+                k += 1
+        mean /= SIZE
+        mean_change /= SIZE
+        ww, wp, cc, cp, cw = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for k in range(SIZE):
+            w, c, p = warped[k] - mean, change[k] - mean_change, patch[k]
+            ww += w * w
+            wp += w * p
+            cc += c * c
+            cp += c * p
+            cw += c * w
+        correlation = wp / np.sqrt(ww * energy + np.float32(1e-6))
+        scores[n] = correlation
+        if correlation < CORRELATION_MIN:
+            continue
+        gain = min(max(np.sqrt(energy / (ww + np.float32(1e-6))), np.float32(GAIN_MIN)), np.float32(GAIN_MAX))
+        gradient += gain * (cp - gain * cw)
+        curvature += gain * gain * cc
+        residual += energy - np.float32(2.0) * gain * wp + gain * gain * ww
+        used += 1
+    total = np.float32(0.0)
+    for _ in range(better_half):
+        top_view = 0
+        for n in range(1, len(scores)):
+            if scores[n] > scores[top_view]:
+                top_view = n
+        total += scores[top_view]
+        scores[top_view] = -2.0
+    if used == 0 or not curvature > 0.0:
+        return np.float32(-1.0), np.float32(0.0), np.float32(0.0)
+    variance = max(residual, np.float32(0.0)) / np.float32(used * SIZE) + np.float32(NOISE * NOISE)
+    return total / np.float32(better_half), gradient / curvature, np.sqrt(variance / curvature)

@@ -1,0 +1,197 @@
+"""Dense depth to a pixel's accuracy: plane sweep over all neighbours, census cost, semi-global matching.
+
+Collins, "A space-sweep approach to true multi-image matching", 1996; Zabih and Woodfill, "Non-parametric local
+transforms for computing visual correspondence", 1994; Hirschmueller, "Stereo processing by semiglobal matching and
+mutual information", 2008. The cost is taken in the reference view straight from the poses, so no pair is rectified and
+baselines of any direction share one volume.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+RADIUS = 2  # of the census window, 24 comparisons: larger windows flatten pipes and fatten their edges
+PENALTY_SMALL = 6  # for a step of one hypothesis, of 48 = two views that differ in all comparisons
+PENALTY_LARGE = 48  # for a jump
+MAX_HYPOTHESES = 256  # bounds the memory, 5 bytes a pixel and hypothesis; beyond, steps get wider than a pixel
+OVERSAMPLING = 2  # of the neighbours, so that a rounded position is at most a quarter of a pixel off
+_BITS = (2 * RADIUS + 1) ** 2 - 1
+_HALF = 1 << (_BITS // 2)
+_ONES = np.array([bin(code).count("1") for code in range(2 * _HALF)], np.uint8)  # of either half of a code
+_UNSEEN = _BITS // 2  # cost of a view that does not see the point: no opinion
+
+
+def sweep(
+    image: NDArray[np.float32],
+    neighbours: NDArray[np.float32],
+    homographies: NDArray[np.float64],
+    epipoles: NDArray[np.float64],
+    inverse_range: tuple[float, float],
+) -> NDArray[np.float32]:
+    """(h, w) inverse depth of the reference image, NaN at the ends of the range.
+
+    `neighbours` (N, h2, w2) are images of OVERSAMPLING times the resolution, low-passed alike; a pixel (u, v) of
+    inverse depth i lies at the homogeneous pixel homographies[n] @ (u, v, 1) + i * epipoles[n] of them.
+    """
+    height, width = image.shape
+    least, most = inverse_range
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float).T
+    longest = 0.0  # track of a pixel over the range
+    for homography, epipole in zip(homographies, epipoles, strict=True):
+        ends = [homography @ corners + inverse * epipole[:, None] for inverse in (least, most)]
+        if min(end[2].min() for end in ends) > 0:
+            track = ends[1][:2] / ends[1][2] - ends[0][:2] / ends[0][2]
+            longest = max(longest, float(np.linalg.norm(track, axis=0).max()) / OVERSAMPLING)
+    count = int(np.clip(np.ceil(longest) + 1, 8, MAX_HYPOTHESES))
+    step = (most - least) / (count - 1)
+    costs = _cost_volume(
+        _census(image, 1),
+        np.stack([_census(neighbour, OVERSAMPLING) for neighbour in neighbours]),
+        homographies.astype(np.float32),
+        epipoles.astype(np.float32),
+        np.float32(least),
+        np.float32(step),
+        count,
+    )
+    index = _best(_aggregate(costs, PENALTY_SMALL, PENALTY_LARGE))
+    return (least + step * index).astype(np.float32)
+
+
+@njit(cache=True, parallel=True)
+def _census(image, stride):  # type: ignore[no-untyped-def]
+    """Bit string of a pixel: which pixels around it, `stride` apart, are darker. 0 at the border: unknown."""
+    height, width = image.shape
+    margin = RADIUS * stride
+    out = np.zeros((height, width), np.uint32)
+    for v in prange(margin, height - margin):
+        for u in range(margin, width - margin):
+            bits = 1  # a leading one tells the code of a flat patch from unknown
+            for i in range(-RADIUS, RADIUS + 1):
+                for j in range(-RADIUS, RADIUS + 1):
+                    if i != 0 or j != 0:
+                        bits = 2 * bits + int(image[v + i * stride, u + j * stride] < image[v, u])
+            out[v, u] = bits
+    return out
+
+
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def _cost_volume(census, others, homographies, epipoles, least, step, count):  # type: ignore[no-untyped-def]
+    """(h, w, count) uint8: sum of the two best views' Hamming distances, so that one occluded side does no harm."""
+    height, width = census.shape
+    number, other_height, other_width = others.shape
+    costs = np.empty((height, width, count), np.uint8)
+    for v in prange(height):
+        cost = np.empty(count, np.uint8)
+        first = np.empty(count, np.uint8)
+        second = np.empty(count, np.uint8)
+        for u in range(width):
+            code = census[v, u]
+            first[:] = 255
+            second[:] = 255
+            for n in range(number):
+                h, e = homographies[n], epipoles[n]
+                x0 = h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * least
+                y0 = h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * least
+                z0 = h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * least
+                dx, dy, dz = e[0] * step, e[1] * step, e[2] * step
+                for d in range(count):
+                    k = np.float32(d)
+                    inverse = np.float32(1.0) / (z0 + dz * k)
+                    x = np.int32((x0 + dx * k) * inverse + np.float32(0.5))
+                    y = np.int32((y0 + dy * k) * inverse + np.float32(0.5))
+                    cost[d] = _UNSEEN
+                    if 0 <= x < other_width and 0 <= y < other_height and others[n, y, x] != 0:
+                        difference = code ^ others[n, y, x]
+                        cost[d] = _ONES[difference % _HALF] + _ONES[difference // _HALF]
+                for d in range(count):
+                    second[d] = min(second[d], max(first[d], cost[d]))
+                    first[d] = min(first[d], cost[d])
+            if number == 1:
+                second[:] = first
+            for d in range(count):
+                costs[v, u, d] = first[d] + second[d]
+    return costs
+
+
+@njit(cache=True, parallel=True)
+def _aggregate(costs, penalty_small, penalty_large):  # type: ignore[no-untyped-def]
+    """(2, h, w, D) uint16: path costs from above (left, upper left, up, upper right) and, mirrored, from below."""
+    height, width, count = costs.shape
+    sums = np.empty((2, height, width, count), np.uint16)
+    for half in prange(2):
+        above = np.zeros((3, width + 2, count), np.uint16)
+        here = np.zeros((3, width + 2, count), np.uint16)
+        above_least = np.zeros((3, width + 2), np.uint16)
+        here_least = np.zeros((3, width + 2), np.uint16)
+        left = np.zeros(count, np.uint16)
+        path = np.zeros(count, np.uint16)
+        for row in range(height):
+            v = row if half == 0 else height - 1 - row
+            left[:] = 0
+            left_least = np.uint16(0)
+            for column in range(width):
+                u = column if half == 0 else width - 1 - column
+                cost = costs[v, u]
+                total = sums[half, v, u]
+                _extend(cost, left, left_least, path, penalty_small, penalty_large)
+                least = np.uint16(65535)
+                for d in range(count):
+                    value = path[d]
+                    left[d] = value
+                    total[d] = value
+                    least = min(least, value)
+                left_least = least
+                for k in range(3):
+                    source = column + k  # the padded columns of upper left, up and upper right
+                    out = here[k, column + 1]
+                    _extend(cost, above[k, source], above_least[k, source], out, penalty_small, penalty_large)
+                    least = np.uint16(65535)
+                    for d in range(count):
+                        value = out[d]
+                        total[d] += value
+                        least = min(least, value)
+                    here_least[k, column + 1] = least
+            for k in range(3):
+                here[k, 0] = here[k, 1]
+                here[k, width + 1] = here[k, width]
+                here_least[k, 0] = here_least[k, 1]
+                here_least[k, width + 1] = here_least[k, width]
+            above, here = here, above
+            above_least, here_least = here_least, above_least
+    return sums
+
+
+@njit(inline="always")
+def _extend(cost, path, least, out, penalty_small, penalty_large):  # type: ignore[no-untyped-def]
+    """Equation 13 of Hirschmueller: the path cost of a pixel from that of the pixel before."""
+    last = len(cost) - 1
+    small = np.uint16(penalty_small)
+    jump = np.uint16(least + np.uint16(penalty_large))
+    out[0] = np.uint16(cost[0] + min(min(path[0], np.uint16(path[1] + small)), jump) - least)
+    for d in range(1, last):
+        step = np.uint16(min(path[d - 1], path[d + 1]) + small)
+        out[d] = np.uint16(np.uint16(cost[d]) + min(min(path[d], step), jump) - least)
+    out[last] = np.uint16(cost[last] + min(min(path[last], np.uint16(path[last - 1] + small)), jump) - least)
+
+
+@njit(cache=True, parallel=True)
+def _best(sums):  # type: ignore[no-untyped-def]
+    """(h, w) float32 index of the least sum, refined between its two neighbours; NaN at either end of the range."""
+    _, height, width, count = sums.shape
+    out = np.full((height, width), np.nan, np.float32)
+    for v in prange(height):
+        for u in range(width):
+            above, below = sums[0, v, u], sums[1, v, u]
+            best, least = 0, np.int32(1 << 30)
+            for d in range(count):
+                value = np.int32(above[d]) + np.int32(below[d])
+                if value < least:
+                    best, least = d, value
+            if 0 < best < count - 1:
+                before = np.int32(above[best - 1]) + np.int32(below[best - 1])
+                after = np.int32(above[best + 1]) + np.int32(below[best + 1])
+                flank = max(before, after) - least
+                out[v, u] = best + (0.5 * (before - after) / flank if flank > 0 else 0.0)
+    return out
