@@ -24,13 +24,14 @@ from pipeprog_sfm.ellipse import TargetEllipses
 # x to the right along the wall, y into it, z up (REP 103), for a board whose y axis points up.
 MAP_FROM_BOARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
-# Errors before any residual is seen, and how many residuals that knowledge is worth: an edge-fitted centre, and the
-# shift of all circles of one image that an error of its pose causes (the reprojection error of a sound model).
-PRIOR_CENTRE = 0.05  # px
-PRIOR_SHIFT = 0.15  # px
+# Errors as expected before any residual is seen, and how many residuals that knowledge is worth: of a centre from
+# fitted edges, and of a pose, in px at the board (its tie points, some 0.3 px each, are many).
+PRIOR_CENTRE = 0.03
+PRIOR_POSE = 0.1
 PRIOR_WEIGHT = 4.0
 
 CAUCHY = 2.385  # 95 % efficiency for normal errors
+CAUCHY_SQUARE = 0.630  # mean of weight times squared residual, of normal errors in two dimensions, over that without
 LARGEST_SIGMA = 0.01  # relative; a scale known worse than that is not published
 CONTRADICTION = 1e-4  # probability with which a sound board is taken for one that contradicts its file
 
@@ -169,7 +170,7 @@ class _Placed:
     placement: FloatArray  # (4, 4) model_from_board
     sigma: float  # relative, of the scale
     centre_sigma: float  # px
-    shift_sigma: float  # px
+    pose_sigma: float  # px at the board
 
     @property
     def scale(self) -> float:
@@ -346,28 +347,27 @@ def _adjusted(
 ) -> _Placed:
     """The placement adjusted on all views: seven parameters, robust weights, two variance components.
 
-    The residuals of one image share the shift that an error of its pose causes, so that five circles in one image
-    are not five independent witnesses: a row's covariance is centre^2 I + shift^2 within an image.
+    The residuals of one image share what an error of its pose does to them, so that five circles in one image are
+    not five independent witnesses: the covariance of an image is centre^2 I + pose^2 B B^T, where B holds the
+    derivatives by the camera's place, in px per px at the board.
     """
-    placement, centre, shift = start, PRIOR_CENTRE, PRIOR_SHIFT
-    for _ in range(3):
+    placement, centre, pose = start, PRIOR_CENTRE, PRIOR_POSE
+    for _ in range(4):
         rows = _rows(views, poses, _pixels(views, placement, poses, camera, config))
         for _ in range(6):
             residuals, jacobian = _similarity_rows(rows, placement, board, camera)
-            residuals, jacobian = _whitened(residuals, jacobian, rows.groups, centre, shift)
-            weights = _cauchy(residuals)
-            flat = (jacobian * np.sqrt(weights)[:, None, None]).reshape(-1, 7)
-            change = np.linalg.lstsq(flat, -(residuals * np.sqrt(weights)[:, None]).ravel(), rcond=None)[0]
+            noise = _noise(jacobian[:, :, 3:6], rows.groups, centre, pose)
+            white, white_jacobian = noise.whitened(residuals[..., None])[..., 0], noise.whitened(jacobian)
+            root = np.sqrt(_cauchy(white))[:, None]
+            flat, target = (white_jacobian * root[..., None]).reshape(-1, 7), (white * root).ravel()
+            change = np.linalg.lstsq(flat, -target, rcond=None)[0]
             placement = _turned(placement, change, board)
             if np.abs(change).max() < 1e-10:
                 break
-        raw, _ = _similarity_rows(rows, placement, board, camera)
-        centre, shift = _components(raw, rows.groups, weights)
-    residuals, jacobian = _similarity_rows(rows, placement, board, camera)
-    residuals, jacobian = _whitened(residuals, jacobian, rows.groups, centre, shift)
-    flat = (jacobian * np.sqrt(_cauchy(residuals))[:, None, None]).reshape(-1, 7)
-    covariance = np.linalg.pinv(flat.T @ flat)
-    return _Placed(board, tuple(views), placement, float(np.sqrt(covariance[6, 6])), centre, shift)
+        sigma = float(np.sqrt(np.linalg.pinv(flat.T @ flat)[6, 6]))
+        components = centre, pose
+        centre, pose = _components(noise, target, flat)
+    return _Placed(board, tuple(views), placement, sigma, *components)
 
 
 def _pixels(
@@ -407,20 +407,42 @@ def _turned(placement: FloatArray, change: FloatArray, board: Board) -> FloatArr
     return changed
 
 
-def _whitened(
-    residuals: FloatArray, jacobian: FloatArray, groups: NDArray[np.intp], centre: float, shift: float
-) -> tuple[FloatArray, FloatArray]:
-    """Rows scaled to unit covariance: deviations from the image's mean by `centre`, the mean by both components."""
+@dataclass(frozen=True)
+class _Noise:
+    """Covariance of all rows: images are independent, centre^2 I + pose^2 B B^T each; U holds B's left directions."""
+
+    groups: NDArray[np.intp]
+    directions: FloatArray  # (M, 2, 3) U
+    shares: FloatArray  # (G, 3) part of the variance along each direction that is the pose's
+    centre: float
+    pose: float
+
+    def along(self, values: FloatArray) -> FloatArray:
+        """(G, 3, P) components of (M, 2, P) values along the directions."""
+        products = np.einsum("mik,mip->mkp", self.directions, values)
+        sums = np.zeros((len(self.shares), *products.shape[1:]))
+        np.add.at(sums, self.groups, products)
+        return sums
+
+    def whitened(self, values: FloatArray) -> FloatArray:
+        """(M, 2, P) rows times the inverse root of the covariance."""
+        shrink = self.along(values) * (np.sqrt(1.0 - self.shares) - 1.0)[..., None]
+        return (values + np.einsum("mik,mkp->mip", self.directions, shrink[self.groups])) / self.centre
+
+
+def _noise(by_place: FloatArray, groups: NDArray[np.intp], centre: float, pose: float) -> _Noise:
+    """Noise of rows whose derivatives by the camera's place (up to sign) are (M, 2, 3)."""
     count = np.bincount(groups)
-    factor = centre / np.sqrt(centre**2 + count * shift**2)
-    scaled = []
-    for values in (residuals, jacobian):
-        flat = values.reshape(len(values), -1)
-        sums = np.zeros((len(count), flat.shape[1]))
-        np.add.at(sums, groups, flat)
-        means = sums / count[:, None]
-        scaled.append(((flat + ((factor - 1)[:, None] * means)[groups]) / centre).reshape(values.shape))
-    return scaled[0], scaled[1]
+    products = np.zeros((len(count), 3, 3))
+    np.add.at(products, groups, by_place.transpose(0, 2, 1) @ by_place)
+    values, vectors = np.linalg.eigh(products)
+    # Unit of the place: a shift of 1 px of all circles, the two larger of the three directions.
+    values = np.maximum(values, 1e-12 * values[:, 2:])
+    directions = by_place @ (vectors / np.sqrt(values)[:, None, :])[groups]
+    variances = pose**2 * values * (count / values[:, 2])[:, None]
+    # A single circle has two residuals: its third direction is nought and carries nothing.
+    shares = np.where(values > 1e-9 * values[:, 2:], variances / (variances + centre**2), 0.0)
+    return _Noise(groups, directions * (shares > 0)[groups][:, None, :], shares, centre, pose)
 
 
 def _cauchy(residuals: FloatArray) -> FloatArray:
@@ -428,18 +450,29 @@ def _cauchy(residuals: FloatArray) -> FloatArray:
     return 1.0 / (1.0 + (residuals**2).sum(-1) / CAUCHY**2)
 
 
-def _components(residuals: FloatArray, groups: NDArray[np.intp], weights: FloatArray) -> tuple[float, float]:
-    """Standard deviations of a centre and of an image's common shift, px, each starting from what is known before."""
-    count = np.bincount(groups)
-    total = np.bincount(groups, weights)
-    means = np.stack([np.bincount(groups, weights * column) for column in residuals.T], -1) / total[:, None]
-    within = (weights[:, None] * (residuals - means[groups]) ** 2).sum()
-    freedom = 2 * (total.sum() - total.sum() / count.sum() * len(count))
-    centre2 = (PRIOR_WEIGHT * PRIOR_CENTRE**2 + within) / (PRIOR_WEIGHT + freedom)
-    support = total / count
-    between = (support[:, None] * (means**2 - centre2 / count[:, None])).sum()
-    shift2 = (PRIOR_WEIGHT * PRIOR_SHIFT**2 + max(between, 0.0)) / (PRIOR_WEIGHT + 2 * support.sum())
-    return float(np.sqrt(centre2)), float(np.sqrt(shift2))
+def _components(noise: _Noise, residuals: FloatArray, jacobian: FloatArray) -> tuple[float, float]:
+    """Standard deviations of a centre and of a pose, px, from whitened, weighted residuals (2M,) and derivatives.
+
+    One step of restricted maximum likelihood: each residual counts for a component by its share of the variance,
+    less what the seven parameters absorb of it; the mean of the posterior that starts from the priors.
+    """
+    covariance = np.linalg.pinv(jacobian.T @ jacobian)
+    parts = noise.along(jacobian.reshape(-1, 2, 7))
+    absorbed = np.einsum("gki,ij,gkj->gk", parts, covariance, parts)
+    squares = noise.along(residuals.reshape(-1, 2, 1))[..., 0] ** 2
+    by_pose = float((noise.shares * squares).sum())
+    pose_freedom = max(float((noise.shares * (1.0 - absorbed)).sum()), 0.0)
+    by_centre = float(residuals @ residuals) - by_pose
+    centre_freedom = max(len(residuals) - 7 - pose_freedom, 0.0)
+    found = []
+    for prior, sigma, squared, freedom in (
+        (PRIOR_CENTRE, noise.centre, by_centre, centre_freedom),
+        (PRIOR_POSE, noise.pose, by_pose, pose_freedom),
+    ):
+        found.append(
+            np.sqrt((PRIOR_WEIGHT * prior**2 + sigma**2 * squared / CAUCHY_SQUARE) / (PRIOR_WEIGHT - 2.0 + freedom))
+        )
+    return float(found[0]), float(found[1])
 
 
 def _combine(
@@ -514,7 +547,7 @@ def _measured(place: _Placed, poses: Mapping[int, FloatArray], camera: Camera, c
     rows = _rows(place.views, poses, _pixels(place.views, place.placement, poses, camera, config))
     residuals = np.full((len(board.centres), 3), np.nan)
     sigmas, pixels = residuals.copy(), residuals[:, 0].copy()
-    noise = np.hypot(place.centre_sigma, place.shift_sigma)
+    noise = np.hypot(place.centre_sigma, place.pose_sigma)
     to_metres = place.placement[:3, :3].T * scale**2  # its transpose is the rotation over the scale
     points = np.full((len(board.centres), 3), np.nan)
     for circle in range(len(board.centres)):
