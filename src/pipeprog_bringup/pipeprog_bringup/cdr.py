@@ -142,6 +142,23 @@ def image_encoding(data: bytes, type_name: str) -> str:
         return ""
 
 
+def is_whole(data: bytes, type_name: str) -> bool:
+    """Whether an image message is as long as it says; what its pixels hold is another matter."""
+    try:
+        reader = _Reader(data)
+        reader.header()
+        if type_name == IMAGE:
+            reader.numbers("I", 2)
+        reader.string()
+        if type_name == IMAGE:
+            reader.numbers("B", 1)
+            reader.number("I")
+        length = reader.number("I")
+    except (struct.error, IndexError):
+        return False
+    return len(data) >= reader.position + length
+
+
 def write_compressed_image(stamp: int, frame_id: str, image_format: str, encoded: bytes) -> bytes:
     """CDR bytes of a CompressedImage."""
     writer = _Writer()

@@ -6,6 +6,7 @@ Whatever takes long to import is imported inside the commands, so that --help an
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -38,6 +39,40 @@ def options(version: Annotated[bool, typer.Option("--version", help="Print the v
 
         typer.echo(f"pipeprog {metadata.version('pipeprog_bringup')}")
         raise typer.Exit
+
+
+@app.command(rich_help_panel="From recordings")
+def replay(
+    bag: Annotated[Path, typer.Argument(help="Recording: an .mcap file or a rosbag2 folder.")],
+    boq: Boq,
+    out: Out,
+    board: Annotated[
+        Path | None, typer.Option("--board", help="Target boards (YAML): the scale.", metavar="BOARD.yaml")
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", help="Play at R times real time; as fast as it goes without.", metavar="R"),
+    ] = None,
+    overrides: Set = None,
+    force: Force = False,
+    image_topic: Annotated[str | None, typer.Option(help="Which camera, where there are several.")] = None,
+    camera_info_topic: Annotated[str | None, typer.Option(help="Its calibration.")] = None,
+) -> None:
+    """Run the node graph on a recording: keyframes, metric map, classified pipes, progress."""
+    from pipeprog_bringup.console import print_progress, replay_bars
+    from pipeprog_bringup.replay import Request
+    from pipeprog_bringup.replay import replay as run
+
+    request = Request(bag, boq, out, board, rate, overrides or (), force, image_topic, camera_info_topic)
+    with replay_bars() as report:
+        outcome = run(request, report)
+    for loss in outcome.losses:
+        _note(loss)
+    print_progress(outcome.pipes, outcome.classes)
+    typer.echo(
+        f"{outcome.frames} frames considered, {outcome.registered} of {outcome.keyframes} keyframes registered, "
+        f"{len(outcome.pipes)} pipes: {out / 'pipes.json'}"
+    )
 
 
 @app.command(rich_help_panel="From recordings")
@@ -81,11 +116,14 @@ def score(
 
 def main() -> None:
     """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
+    from pipeprog_bringup.graph import NodeFailure
     from pipeprog_camera.errors import InputError
 
+    # As for Ctrl-C, what was started is ended and what was half written is removed.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         code = app(prog_name="pipeprog", standalone_mode=False)
-    except InputError as error:
+    except (InputError, NodeFailure) as error:
         _fail(str(error))
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from pipeprog_bringup.replay import State
     from pipeprog_detect.classify import ClassProgress
     from pipeprog_detect.pipe import Pipe
 
@@ -35,6 +36,24 @@ def share_bar(name: str) -> Iterator[Callable[[float, str], None]]:
 
         def report(share: float, stage: str) -> None:
             display.update(task, completed=share, detail=stage)
+
+        yield report
+
+
+@contextlib.contextmanager
+def replay_bars() -> Iterator[Callable[[State], None]]:
+    """Three bars, moved by the states of a replay: frames considered, keyframes registered, stage."""
+    with progress_display() as display:
+        frames = display.add_task("frames considered", total=None, detail="")
+        keyframes = display.add_task("keyframes registered", total=None, detail="")
+        stage = display.add_task("starting", total=None, detail="")
+
+        def report(state: State) -> None:
+            counted = f"{state.considered}/{state.frames}"
+            display.update(frames, total=state.frames, completed=state.considered, detail=counted)
+            registered = f"{state.registered}/{state.keyframes}"
+            display.update(keyframes, total=state.keyframes or None, completed=state.registered, detail=registered)
+            display.update(stage, description=state.stage)
 
         yield report
 

@@ -1,0 +1,74 @@
+"""What became of each frame of a replay: which are still on their way, and why each was chosen or not."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict, deque
+from dataclasses import replace
+
+from pipeprog_bringup.results import FrameRow
+
+
+class FrameLog:
+    """Rows of frames.csv in the order of playing, filled by the decisions and the SfM's feedback as they come."""
+
+    def __init__(self) -> None:
+        self._rows: list[FrameRow | None] = []
+        self._pending: defaultdict[int, deque[int]] = defaultdict(deque)
+        self._first: dict[int, int] = {}
+        self._overlap: dict[int, tuple[float, bool]] = {}
+
+    @property
+    def in_flight(self) -> int:
+        """Frames that were played and not decided on."""
+        return sum(len(rows) for rows in self._pending.values())
+
+    @property
+    def considered(self) -> int:
+        """Frames that were decided on."""
+        return len(self._rows) - self.in_flight
+
+    @property
+    def chosen(self) -> int:
+        """Keyframes."""
+        return sum(row is not None and row.chosen for row in self._rows)
+
+    def play(self, stamp: int) -> None:
+        """A frame was sent to the selector."""
+        self._pending[stamp].append(len(self._rows))
+        self._first.setdefault(stamp, len(self._rows))
+        self._rows.append(None)
+
+    def skip(self, stamp: int, reason: str) -> None:
+        """A frame could not even be sent."""
+        self._rows.append(FrameRow(stamp, False, reason))
+
+    def decide(self, row: FrameRow) -> None:
+        """A decision came; a second one about a frame revokes the first."""
+        waiting = self._pending.get(row.stamp)
+        if waiting:
+            self._rows[waiting.popleft()] = row
+            if not waiting:
+                del self._pending[row.stamp]
+        elif row.stamp in self._first:
+            self._rows[self._first[row.stamp]] = row
+
+    def overlap(self, stamp: int, overlap: float, registered: bool) -> None:
+        """The SfM measured how well a keyframe is tied into the model (Ov_N, Eq. 1 of the paper)."""
+        self._overlap[stamp] = overlap, registered
+
+    def rows(self) -> list[FrameRow]:
+        """One row a frame that was considered, keyframes with their last overlap."""
+        result = []
+        for row in self._rows:
+            if row is None:
+                continue
+            if row.chosen and row.stamp in self._overlap:
+                overlap, registered = self._overlap[row.stamp]
+                row = replace(row, overlap_n=overlap if registered else None, registered=registered)
+            result.append(row)
+        return result
+
+    def common_reasons(self) -> str:
+        """The reasons most frequent among the frames that were not chosen, for an error's text."""
+        reasons = Counter(row.reason for row in self._rows if row is not None and not row.chosen)
+        return "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))

@@ -1,0 +1,168 @@
+"""The three nodes as processes of one replay: started together, watched, and never left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import yaml
+
+NODE_MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"}
+_STOP_SECONDS = 3.0
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None)
+# Domains whose ports stay below the range that Linux hands out to other programs.
+_DOMAINS = range(1, 101)
+
+
+class NodeFailure(Exception):
+    """A node died, fell silent or could not do its work: the text names it."""
+
+
+class Graph:
+    """Context in which the nodes run; they and all that they started are gone when it ends.
+
+    `parameters` are flat ROS parameters per node; `folder` takes the parameter files and the nodes' output. Each node
+    leads a process group of its own, so that Ctrl-C reaches only the command, which then ends the nodes in order.
+    Should the command itself be killed, the kernel ends the nodes.
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Mapping[str, Any]],
+        folder: Path,
+        modules: Mapping[str, str] = NODE_MODULES,
+    ) -> None:
+        self._parameters, self._folder, self._modules = parameters, folder, modules
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Graph:
+        try:
+            for name in self._modules:
+                self._start(name)
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def check(self) -> None:
+        """Raise NodeFailure when a node has ended."""
+        for name, process in self._processes.items():
+            ended = os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+            if ended is None:
+                continue
+            if ended.si_code == os.CLD_EXITED:
+                how = f"stopped with exit code {ended.si_status}"
+            else:
+                how = f"was killed by {signal.Signals(ended.si_status).name}"
+            raise NodeFailure(f"the node {name} (process {process.pid}) {how}{self._last_words(name)}")
+
+    def stop(self) -> None:
+        """End every node and its children: asked first, killed after a few seconds."""
+        for process in self._processes.values():
+            self._signal(process, signal.SIGINT)
+        deadline = time.monotonic() + _STOP_SECONDS
+        while time.monotonic() < deadline and not all(self._has_ended(p) for p in self._processes.values()):
+            time.sleep(0.02)
+        for process in self._processes.values():
+            # The group outlives its leader while a worker runs; not yet waited for, its number cannot be reused.
+            self._signal(process, signal.SIGKILL)
+            process.wait()
+        self._processes.clear()
+
+    def pids(self) -> dict[str, int]:
+        """Process number of each node."""
+        return {name: process.pid for name, process in self._processes.items()}
+
+    def _start(self, name: str) -> None:
+        parameters = {key: value for key, value in self._parameters.get(name, {}).items() if value is not None}
+        file = self._folder / f"{name}.yaml"
+        file.write_text(yaml.safe_dump({name: {"ros__parameters": parameters}}))
+        arguments = ["--ros-args", "-r", f"__node:={name}", "--params-file", str(file)]
+        command = [sys.executable, "-m", self._modules[name], *arguments]
+        with self._log(name).open("wb") as log:
+            self._processes[name] = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                start_new_session=True,
+                preexec_fn=_die_with_parent,
+            )
+
+    def _log(self, name: str) -> Path:
+        return self._folder / f"{name}.log"
+
+    def _last_words(self, name: str) -> str:
+        lines = self._log(name).read_text(errors="replace").strip().splitlines()
+        return f": {lines[-1].strip()}" if lines else ""
+
+    @staticmethod
+    def _has_ended(process: subprocess.Popen[bytes]) -> bool:
+        return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+    @staticmethod
+    def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+
+
+def _die_with_parent() -> None:
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def private_domain(log_folder: Path) -> Iterator[None]:
+    """Set ROS to a domain of our own on the loopback interface, and its logs; what the user has set is kept."""
+    defaults = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(log_folder)}
+    chosen = {name: os.environ.get(name) or value for name, value in defaults.items()}
+    lock = None
+    if not os.environ.get("ROS_DOMAIN_ID"):
+        domain, lock = _free_domain()
+        chosen["ROS_DOMAIN_ID"] = str(domain)
+    before = {name: os.environ.get(name) for name in chosen}
+    os.environ.update(chosen)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+        if lock is not None:
+            lock.close()
+
+
+def _free_domain() -> tuple[int, socket.socket]:
+    """A domain that no other replay on this machine holds, and that nobody listens in; with the lock that holds it."""
+    for domain in random.SystemRandom().sample(_DOMAINS, len(_DOMAINS)):
+        lock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            # An abstract name: gone with the process, however that ends.
+            lock.bind(f"\0pipeprog-ros-domain-{domain}")
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                # Unicast discovery port of the first participant (RTPS 2.2, 9.6.1.1).
+                probe.bind(("", 7410 + 250 * domain))
+        except OSError:
+            lock.close()
+            continue
+        return domain, lock
+    raise NodeFailure("no free ROS domain from 1 to 100: set ROS_DOMAIN_ID")
