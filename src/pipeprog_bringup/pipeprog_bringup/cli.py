@@ -95,6 +95,27 @@ def detect(
     typer.echo(f"{len(detection.pipes)} pipes in {detection.points} points: {out / 'pipes.json'}")
 
 
+@app.command(rich_help_panel="To recordings")
+def ingest(
+    video: Annotated[Path, typer.Argument(help="Video: mp4, mov, ...")],
+    camera: Annotated[
+        Path, typer.Option("--camera", help="Calibration, as ROS camera_calibration writes it.", metavar="CAMERA.yaml")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The recording to write.", metavar="BAG.mcap")],
+    quality: Annotated[int, typer.Option(min=50, max=100, help="JPEG quality.")] = 95,
+    force: Annotated[bool, typer.Option("--force", help="Replace the recording that --out names.")] = False,
+) -> None:
+    """Make a recording of a video and its camera's calibration."""
+    from pipeprog_bringup.console import share_bar
+    from pipeprog_bringup.ingest import ingest as run
+
+    with share_bar("ingest") as report:
+        ingested = run(video, camera, out, quality, force, report)
+    for note in ingested.notes:
+        _note(note)
+    typer.echo(f"{ingested.frames} frames of {ingested.seconds:.1f} s: {out}")
+
+
 @app.command(rich_help_panel="From results")
 def score(
     pipes: Annotated[Path, typer.Argument(help="pipes.json of a run.", metavar="DIR/pipes.json")],

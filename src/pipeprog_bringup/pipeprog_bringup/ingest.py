@@ -1,0 +1,147 @@
+"""`pipeprog ingest`: a video and its camera's calibration become a recording."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pipeprog_bringup import cdr
+from pipeprog_bringup.bag_writer import BagWriter
+from pipeprog_bringup.output import output_file
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
+
+FRAME_ID = "camera_optical_frame"
+# The first image's stamp: a video knows no clock, and zero means "not set" in ROS.
+START = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """What became of a video: frames written, seconds they span, and what the user should know."""
+
+    frames: int
+    seconds: float
+    notes: list[str]
+
+
+def ingest(
+    video: Path, camera_yaml: Path, out: Path, quality: int, force: bool, report: Callable[[float, str], None]
+) -> Ingested:
+    """Write the frames of `video` as JPEG, with the calibration, into the recording `out`.
+
+    Stamps are the video's own times, so a variable frame rate is kept. Raises InputError where video and calibration
+    cannot be read or do not belong together.
+    """
+    calibrated = read_camera(camera_yaml)
+    if out.suffix != ".mcap":
+        raise InputError(f"--out {out}: a recording is an .mcap file")
+    capture = _open(video)
+    try:
+        camera, notes = _fit(capture, calibrated, video, camera_yaml)
+        expected = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        stamp, count = START, 0
+        with output_file(out, force) as temporary, temporary.open("wb") as stream, BagWriter(stream) as writer:
+            for stamp, image in _frames(capture):
+                encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+                info = cdr.write_camera_info(stamp, FRAME_ID, camera)
+                writer.write("/camera/camera_info", cdr.CAMERA_INFO, info, stamp)
+                data = cdr.write_compressed_image(stamp, FRAME_ID, "jpeg", encoded)
+                writer.write("/camera/image/compressed", cdr.COMPRESSED_IMAGE, data, stamp)
+                count += 1
+                report(count / expected if expected > 0 else 0.0, f"{count} frames")
+            if not count:
+                raise InputError(f"{video} holds no frame that can be decoded: convert it to H.264 in an .mp4 file")
+    finally:
+        capture.release()
+    # Containers count the last few frames generously; more than that is a video cut short.
+    if count < 0.98 * expected - 2:
+        notes.append(f"{video} ends early: {count} of {expected} frames could be read")
+    return Ingested(count, (stamp - START) * 1e-9, notes)
+
+
+def read_camera(path: Path) -> Camera:
+    """A calibration in the YAML format of ROS's camera_calibration; raises InputError where it is none."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"{path}: the calibration cannot be read ({' '.join(str(error).split())})") from None
+    try:
+        size = int(content["image_width"]), int(content["image_height"])
+        matrix = np.asarray(content["camera_matrix"]["data"], float).reshape(3, 3)
+        distortion = [float(value) for value in content["distortion_coefficients"]["data"]]
+        model = str(content.get("distortion_model", content.get("camera_model", "plumb_bob")))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise InputError(
+            f"{path} is no camera calibration ({what}): it needs image_width, image_height, camera_matrix.data, "
+            "distortion_model, distortion_coefficients.data"
+        ) from None
+    try:
+        return Camera.from_calibration(*size, matrix, model, distortion)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _open(video: Path) -> Any:
+    if not video.is_file():
+        raise InputError(f"no such video: {video}")
+    # What FFmpeg itself would say on stderr, the errors here say in the user's terms.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    capture = cv2.VideoCapture(str(video))
+    if not capture.isOpened():
+        raise InputError(f"{video} is no video that can be read: convert it to H.264 in an .mp4 file")
+    return capture
+
+
+def _fit(capture: Any, calibrated: Camera, video: Path, camera_yaml: Path) -> tuple[Camera, list[str]]:
+    """The camera of the frames, and whether they are taken as the sensor saw them or upright as players show them.
+
+    A phone writes the sensor's frames and a rotation. Mostly the sensor was calibrated; who calibrated by upright
+    frames has their size in the calibration.
+    """
+    width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    turned = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 != 0
+    upright = bool(capture.get(cv2.CAP_PROP_ORIENTATION_AUTO))
+    # OpenCV gives the size of the frames that it will return.
+    sensor = (height, width) if turned and upright else (width, height)
+    sizes = {False: sensor, True: sensor[::-1] if turned else sensor}
+    for is_upright, size in sizes.items():
+        if size == (calibrated.width, calibrated.height):
+            capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, float(is_upright))
+            return calibrated, []
+    for is_upright, size in sizes.items():
+        factor = size[0] / calibrated.width
+        if abs(factor * calibrated.height - size[1]) <= 1.0:
+            capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, float(is_upright))
+            note = (
+                f"{camera_yaml} is of {calibrated.width} x {calibrated.height}, the video of {size[0]} x {size[1]}: "
+                "scaled, which holds only where both modes use the whole width of the sensor"
+            )
+            return calibrated.scaled(factor), [note]
+    raise InputError(
+        f"{video} is {sensor[0]} x {sensor[1]}, but {camera_yaml} was calibrated at "
+        f"{calibrated.width} x {calibrated.height}, which has another aspect: calibrate in the video's own mode"
+    )
+
+
+def _frames(capture: Any) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Stamps [ns] and images; where the container has no time for a frame, its rate stands in."""
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    step = round(1e9 / rate) if 0 < rate < 1000 else 33_333_333
+    last = START - step
+    while True:
+        ok, image = capture.read()
+        if not ok:
+            return
+        stamp = START + round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+        last = stamp if stamp > last else last + step
+        yield last, image
