@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from nav_msgs.msg import Path
+from numpy.typing import NDArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
-from std_msgs.msg import ColorRGBA
+from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pipeprog_camera.camera import Camera
@@ -20,7 +22,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.bill import Bill, load_bill
 from pipeprog_detect.classify import ClassProgress
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.markers import pipe_markers
+from pipeprog_detect.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
 from pipeprog_detect.pipe import Pipe
 from pipeprog_detect.worker import Keyframe, Map, PipesReady, serve
 from pipeprog_msgs import msg, srv
@@ -145,7 +147,8 @@ class DetectNode(Node):
             )
         )
         markers = [Marker(header=header, action=Marker.DELETEALL)]
-        markers += [_marker_msg(marker, header) for marker in pipe_markers(event.pipes, self._bill)]
+        for number, marker in enumerate(pipe_markers(event.pipes, self._bill)):
+            markers += _marker_msgs(number, marker, header)
         self._markers.publish(MarkerArray(markers=markers))
         self._finish_when_published()
 
@@ -159,11 +162,10 @@ class DetectNode(Node):
 
 
 def _pipe_msg(pipe: Pipe) -> msg.Pipe:
-    start, end = pipe.cylinder.start.tolist(), pipe.cylinder.end.tolist()
     return msg.Pipe(
         id=pipe.id,
-        start=Point(x=start[0], y=start[1], z=start[2]),
-        end=Point(x=end[0], y=end[1], z=end[2]),
+        start=_point(pipe.cylinder.start),
+        end=_point(pipe.cylinder.end),
         radius=pipe.cylinder.radius,
         radius_sigma=pipe.radius_sigma,
         class_name=pipe.class_name or "",
@@ -172,6 +174,36 @@ def _pipe_msg(pipe: Pipe) -> msg.Pipe:
         rmse=pipe.rmse,
         points=pipe.points,
     )
+
+
+def _marker_msgs(number: int, marker: PipeMarker, header: Header) -> list[Marker]:
+    x, y, z, w = marker.orientation.tolist()
+    red, green, blue = marker.color
+    cylinder = Marker(
+        header=header,
+        ns="pipes",
+        id=number,
+        type=Marker.CYLINDER,
+        pose=Pose(position=_point(marker.centre), orientation=Quaternion(x=x, y=y, z=z, w=w)),
+        scale=Vector3(x=2.0 * marker.radius, y=2.0 * marker.radius, z=marker.length),
+        color=ColorRGBA(r=red, g=green, b=blue, a=1.0),
+    )
+    label = Marker(
+        header=header,
+        ns="labels",
+        id=number,
+        type=Marker.TEXT_VIEW_FACING,
+        pose=Pose(position=_point(marker.text_position)),
+        scale=Vector3(z=LABEL_HEIGHT),
+        color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0),
+        text=marker.text,
+    )
+    return [cylinder, label]
+
+
+def _point(position: NDArray[np.float64]) -> Point:
+    x, y, z = position.tolist()
+    return Point(x=x, y=y, z=z)
 
 
 def _progress_msg(row: ClassProgress, bill: Bill) -> msg.ClassProgress:
