@@ -64,16 +64,8 @@ class Fusion:
             AGREEMENT,
             self._config.min_views - 1,
         )
-        rows, columns = np.nonzero(agreeing)
-        z = depth[rows, columns].astype(float)
-        fx, fy, cx, cy = view.matrix[0, 0], view.matrix[1, 1], view.matrix[0, 2], view.matrix[1, 2]
-        points_in_camera = np.c_[(columns - cx) / fx * z, (rows - cy) / fy * z, z]
-        rotation, translation = view.camera_from_map[:3, :3], view.camera_from_map[:3, 3]
         self._hash.add(
-            (points_in_camera - translation) @ rotation,
-            normal[rows, columns].astype(float) @ rotation,
-            depth_map.color[rows, columns, ::-1].astype(np.float32),
-            (agreeing[rows, columns] + 1).astype(np.uint8),
+            depth, normal, agreeing, depth_map.color, view.matrix, np.linalg.inv(view.camera_from_map).astype(float)
         )
 
     def cloud(self) -> FusedCloud:
@@ -83,7 +75,10 @@ class Fusion:
     def _overlapping(self, view: _View) -> list[_View]:
         """The earlier views that see most of what this one sees, in order of time."""
         height, width = view.depth.shape
-        rows, columns = (a.ravel() for a in np.mgrid[0 : height - 1 : 12j, 0 : width - 1 : 20j].astype(int))
+        rows, columns = (
+            a.ravel()
+            for a in np.meshgrid(np.linspace(0, height - 1, 12, dtype=int), np.linspace(0, width - 1, 20, dtype=int))
+        )
         z = view.depth[rows, columns].astype(float)
         known = np.isfinite(z)
         if not known.any():
@@ -131,19 +126,31 @@ class _VoxelHash:
         self._size = 0
 
     def add(
-        self, points: FloatArray, normals: FloatArray, colors: NDArray[np.float32], views: NDArray[np.uint8]
+        self,
+        depth: NDArray[np.float32],
+        normal: NDArray[np.float32],
+        agreeing: NDArray[np.uint8],
+        color: NDArray[np.uint8],
+        matrix: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
     ) -> None:
-        cells = np.floor(points / self._voxel).astype(np.int64)
-        offsets = points - cells * self._voxel
-        keys = _pack(cells)
-        while 2 * (self._size + len(keys)) > len(self._table):  # an upper bound: most voxels are known already
-            distinct = len(np.unique(keys))
-            if 2 * (self._size + distinct) <= len(self._table):
-                break
+        """Adds the pixels on which any view agrees, weighted by the number of views."""
+        while 2 * (self._size + np.count_nonzero(agreeing)) > len(self._table):
             self._grow()
-        values = np.c_[np.ones(len(points)), offsets, normals, colors].astype(np.float32)
-        values *= views[:, None].astype(np.float32)
-        self._size = _insert(self._table, self._keys, self._sums, self._views, self._size, keys, values, views)
+        self._size = _insert(
+            self._table,
+            self._keys,
+            self._sums,
+            self._views,
+            self._size,
+            self._voxel,
+            depth,
+            normal,
+            agreeing,
+            color,
+            matrix,
+            map_from_camera,
+        )
 
     def cloud(self) -> FusedCloud:
         n = self._size
@@ -175,11 +182,6 @@ _HALF = 1 << (_BITS - 1)
 _MASK = (1 << _BITS) - 1
 
 
-def _pack(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    c = (cells + _HALF) & _MASK
-    return (c[:, 0] << (2 * _BITS)) | (c[:, 1] << _BITS) | c[:, 2]
-
-
 def _unpack(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([(keys >> (2 * _BITS)) & _MASK, (keys >> _BITS) & _MASK, keys & _MASK], axis=1) - _HALF
 
@@ -195,18 +197,41 @@ def _slot(table, keys, key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _insert(table, keys, sums, views, size, new_keys, values, new_views):  # type: ignore[no-untyped-def]
-    for i in range(len(new_keys)):
-        slot = _slot(table, keys, new_keys[i])
-        index = table[slot]
-        if index < 0:
-            index = size
-            table[slot] = index
-            keys[index] = new_keys[i]
-            size += 1
-        for j in range(values.shape[1]):
-            sums[index, j] += values[i, j]
-        views[index] = max(views[index], new_views[i])
+def _insert(  # type: ignore[no-untyped-def]
+    table, keys, sums, views, size, voxel, depth, normal, agreeing, color, matrix, map_from_camera
+):
+    height, width = depth.shape
+    rotation = map_from_camera
+    point, direction, cell = np.empty(3), np.empty(3), np.empty(3, np.int64)
+    for v in range(height):
+        for u in range(width):
+            if agreeing[v, u] == 0:
+                continue
+            z = np.float64(depth[v, u])
+            x, y = (u - matrix[0, 2]) / matrix[0, 0] * z, (v - matrix[1, 2]) / matrix[1, 1] * z
+            nx, ny, nz = normal[v, u]
+            key = np.int64(0)
+            for k in range(3):
+                point[k] = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + rotation[k, 3]
+                direction[k] = rotation[k, 0] * nx + rotation[k, 1] * ny + rotation[k, 2] * nz
+                cell[k] = np.int64(np.floor(point[k] / voxel))
+                key = (key << _BITS) | ((cell[k] + _HALF) & _MASK)
+            slot = _slot(table, keys, key)
+            index = table[slot]
+            if index < 0:
+                index = size
+                table[slot] = index
+                keys[index] = key
+                size += 1
+            count = agreeing[v, u] + 1
+            weight = np.float32(count)
+            total = sums[index]
+            total[0] += weight
+            for k in range(3):
+                total[1 + k] += weight * (point[k] - cell[k] * voxel)
+                total[4 + k] += weight * direction[k]
+                total[7 + k] += weight * color[v, u, 2 - k]  # BGR to RGB
+            views[index] = max(views[index], count)
     return size
 
 

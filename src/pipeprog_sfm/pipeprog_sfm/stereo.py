@@ -81,7 +81,7 @@ def choose_pairs(
     while candidates and len(chosen) < config.max_pairs:
         # 1 for a baseline that repeats a chosen one, 0.5 for the opposite one, 0 for one at right angles to all
         scores = [
-            cost + max((max(d @ other, -0.5 * (d @ other)) for _, other in chosen), default=0.0)
+            cost + max((max(float(d @ other), -0.5 * float(d @ other)) for _, other in chosen), default=0.0)
             for _, cost, d in candidates
         ]
         stamp, _, direction = candidates.pop(int(np.argmin(scores)))
