@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import qmc
 
@@ -12,7 +13,7 @@ from pipeprog_detect.outline import Stations
 from pipeprog_detect.pipe import FloatArray
 
 
-def responses(values: FloatArray, offsets: FloatArray, at: Stations) -> FloatArray:
+def responses(values: NDArray[np.floating], offsets: FloatArray, at: Stations) -> NDArray[np.float32]:
     """Peaks of the gradient along profiles `values` (N, Q): (N, Q) float32, 0 where none, up to 1 for a clear one.
 
     Strength saturates at the median of all peaks: where a shadow's edge is ten times stronger than the outline, both
@@ -29,7 +30,7 @@ def responses(values: FloatArray, offsets: FloatArray, at: Stations) -> FloatArr
     return result
 
 
-def smeared(response: FloatArray, offsets: FloatArray, at: Stations, width: float) -> FloatArray:
+def smeared(response: NDArray[np.float32], offsets: FloatArray, at: Stations, width: float) -> NDArray[np.float32]:
     """Responses (N, Q) spread by a triangle of half-width `width` px and made neutral: mean 0 inside each window."""
     step = offsets[1] - offsets[0]
     taps = np.arange(-int(width / step), int(width / step) + 1) * step
@@ -44,7 +45,9 @@ def smeared(response: FloatArray, offsets: FloatArray, at: Stations, width: floa
 
 
 @njit(cache=True)
-def _scores(steps: FloatArray, jacobian: FloatArray, response: FloatArray, first: float, step: float) -> FloatArray:
+def _scores(
+    steps: FloatArray, jacobian: FloatArray, response: NDArray[np.float32], first: float, step: float
+) -> FloatArray:
     """Sum over stations of the response at the displacement that each step (M, 5) causes there."""
     result = np.zeros(len(steps))
     last = response.shape[1] - 1
@@ -65,7 +68,7 @@ def _scores(steps: FloatArray, jacobian: FloatArray, response: FloatArray, first
 
 def search(
     at: Stations,
-    response: FloatArray,
+    response: NDArray[np.float32],
     offsets: FloatArray,
     reach: FloatArray,
     seeds: FloatArray,

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.consensus import responses, search
-from pipeprog_detect.edges import WINDOW_OF_HALF_WIDTH, LimbEdges, outline_edges, profiles, sideways
+from pipeprog_detect.edges import (
+    SHARP,
+    WINDOW_OF_HALF_WIDTH,
+    LimbEdges,
+    estimate_blur,
+    outline_edges,
+    profiles,
+    sideways,
+)
 from pipeprog_detect.outline import Stations, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.rim import End, find_end
@@ -72,9 +80,12 @@ def refine(
     view_offset: FloatArray = np.zeros(len(views))
     prior = np.zeros(5)
     prior[:4] = 1.0 / (2.0 * initial_radius_sigma) ** 2
+    blur = SHARP
     for reach in (2.5, 1.5, 1.2, 1.2):
         current = moved(cylinder, basis, step)
-        at, edges = outline_edges(current, views, others, basis, view_offset, reach, CHUNK)
+        if reach == 1.5:
+            blur = estimate_blur(current, views, others, basis, view_offset, CHUNK)
+        at, edges = outline_edges(current, views, others, basis, view_offset, reach, blur, CHUNK)
         if len(at) < 20:
             return None
         solution = _solve(at, edges, len(views), prior, step)
@@ -84,7 +95,7 @@ def refine(
     share = support_profile(at, hits(at, _moved_by(edges, at, solution), view_offset)).share
     if share < MIN_SUPPORT or refined.radius <= 0:
         return None
-    ends = [find_end(refined, at_end, views, others, basis, view_offset) for at_end in (False, True)]
+    ends = [find_end(refined, at_end, views, others, basis, view_offset, blur) for at_end in (False, True)]
     return _result(refined, solution, share, basis, at, ends)
 
 

@@ -7,19 +7,24 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_detect.outline import Stations, stations, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 
-# The limb model's window: inwards as far as shading stays smooth, outwards to where the next thing may begin [px].
-INWARD, OUTWARD = 8.0, 3.0
+# The limb model's window: inwards as far as shading stays smooth; outwards, beyond the blur, to where the next thing
+# may begin [px].
+INWARD, OUTWARD, OUTWARD_OF_BLUR = 8.0, 1.5, 3.0
 # A line belongs to one side of the pipe only while it is nearer to it than to the axis.
 WINDOW_OF_HALF_WIDTH = 0.8
-# Blur of an unresized camera image, lens and pixel together [px]; the model's offset hardly depends on it.
-BLUR = 0.5
+# Blur of a sharp image, lens and pixel together, and the ones that are tried [px].
+SHARP = 0.5
+BLURS = np.array([0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.5])
+# Share of Schlick's reflectance that a painted or a rough metal surface keeps at grazing incidence.
+RIM = 0.25
 
 
-def _linear_light() -> FloatArray:
+def _linear_light() -> NDArray[np.float32]:
     """Table from the 256 grey levels of an sRGB image to light, scaled to 0 ... 255 (IEC 61966-2-1)."""
     level = np.arange(256) / 255.0
     return (255.0 * np.where(level < 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)).astype(np.float32)
@@ -29,7 +34,7 @@ def _linear_light() -> FloatArray:
 LINEAR_LIGHT = _linear_light()
 
 
-def profiles(views: Sequence[View], at: Stations, offsets: FloatArray, rows: int) -> FloatArray:
+def profiles(views: Sequence[View], at: Stations, offsets: FloatArray, rows: int) -> NDArray[np.float32]:
     """Light (N, Q) float32, 0 ... 255, along the outward normals at `offsets` (Q,) px, the mean of `rows` such lines.
 
     Samples outside the image repeat its border.
@@ -71,7 +76,8 @@ def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
     """Model (Q, 5) at outward distances x (Q,) px from a limb of apparent radius `half_width`, blurred by `blur` px.
 
     Outside: a level and a slope; inside: a level, and the two components of a cylinder's normal, of which the one
-    towards the viewer rises as the square root of the depth (Lambert shading of a circular section).
+    towards the viewer rises as the square root of the depth (Lambert shading of a circular section). At grazing
+    incidence the surface reflects what lies just behind it (Fresnel, in Schlick's form): there the outside shows.
     """
     fine = 0.05
     reach = 4.0 * blur
@@ -79,21 +85,47 @@ def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
     inside = np.clip(0.5 - grid / fine, 0.0, 1.0)
     depth = np.clip(-grid, 0.0, half_width) / half_width
     towards = np.sqrt(depth * (2.0 - depth))
-    columns = np.stack([1.0 - inside, (1.0 - inside) * grid / 4.0, inside, inside * depth * half_width / 4.0, towards])
+    mirrored = RIM * (1.0 - towards) ** 5 * inside
+    body = inside - mirrored
+    columns = np.stack([1.0 - body, (1.0 - inside) * grid / 4.0, body, body * depth * half_width / 4.0, body * towards])
     half = int(np.ceil(reach / fine))
     taps = np.arange(-half, half + 1) * fine
     kernel = np.exp(-0.5 * (taps / blur) ** 2)
     kernel /= kernel.sum()
-    blurred = [np.convolve(np.pad(column, len(kernel) // 2, mode="edge"), kernel, mode="valid") for column in columns]
+    blurred = [np.convolve(np.pad(column, half, mode="edge"), kernel, mode="valid") for column in columns]
     return np.stack([np.interp(x, grid, column) for column in blurred], axis=1)
 
 
-def _projector(basis: FloatArray) -> FloatArray:
-    return np.linalg.qr(basis)[0]
+def _costs(
+    values: FloatArray, offsets: FloatArray, half_width: FloatArray, blur: float, trials: FloatArray
+) -> FloatArray:
+    """What `limb_basis` at each trial position leaves of the values' squares (N, T).
+
+    The five levels follow by linear least squares (variable projection). Widths are grouped by 15 %, which moves the
+    limb's shape by less than the noise.
+    """
+    cost = np.empty((len(values), len(trials)))
+    total = np.einsum("ij,ij->i", values, values)
+    group = np.round(np.log(np.maximum(half_width, 1.0)) / np.log(1.15)).astype(int)
+    for key in np.unique(group):
+        members = np.flatnonzero(group == key)
+        width = float(np.exp(key * np.log(1.15)))
+        for index, trial in enumerate(trials):
+            onto = np.linalg.qr(limb_basis(offsets - trial, width, blur))[0]
+            part = values[members] @ onto
+            cost[members, index] = total[members] - np.einsum("ij,ij->i", part, part)
+    return np.maximum(cost, 0.0)
+
+
+def _smooth_cost(values: FloatArray, offsets: FloatArray) -> FloatArray:
+    """What a polynomial with as many coefficients as the limb model leaves (N,)."""
+    smooth = np.linalg.qr(np.vander(offsets / np.abs(offsets).max(), 5))[0]
+    part = values @ smooth
+    return np.maximum(np.einsum("ij,ij->i", values, values) - np.einsum("ij,ij->i", part, part), 1e-9)
 
 
 def limb_edges(
-    values: FloatArray,
+    values: NDArray[np.floating],
     offsets: FloatArray,
     half_width: FloatArray,
     blur: float,
@@ -103,27 +135,12 @@ def limb_edges(
 ) -> LimbEdges:
     """Edges within +-`reach` px of the origin of profiles `values` (N, Q) taken at `offsets` (Q,) px.
 
-    For every trial position the five levels of `limb_basis` follow by linear least squares; local minima of the
-    remaining cost over the position are edges (variable projection). Widths are grouped by 15 %, which moves the
-    limb's shape by less than the noise.
+    Local minima over the position of what the limb model leaves unexplained.
     """
     values = np.asarray(values, float)
-    count = len(values)
-    trials = np.arange(-reach, reach + 0.5 * step, step)
-    cost = np.empty((count, len(trials)))
-    total = np.einsum("ij,ij->i", values, values)
-    group = np.round(np.log(np.maximum(half_width, 1.0)) / np.log(1.15)).astype(int)
-    for key in np.unique(group):
-        members = np.flatnonzero(group == key)
-        width = float(np.exp(key * np.log(1.15)))
-        for index, trial in enumerate(trials):
-            onto = _projector(limb_basis(offsets - trial, width, blur))
-            part = values[members] @ onto
-            cost[members, index] = total[members] - np.einsum("ij,ij->i", part, part)
-    smooth = _projector(np.vander(offsets / np.abs(offsets).max(), 5))
-    part = values @ smooth
-    plain = np.maximum(total - np.einsum("ij,ij->i", part, part), 1e-9)
-    return _minima(np.maximum(cost, 0.0), plain, trials, places, len(offsets))
+    trials = np.arange(-reach, reach + 0.5 * step, step, dtype=float)
+    cost = _costs(values, offsets, half_width, blur, trials)
+    return _minima(cost, _smooth_cost(values, offsets), trials, places, len(offsets))
 
 
 def _minima(cost: FloatArray, plain: FloatArray, trials: FloatArray, places: int, samples: int) -> LimbEdges:
@@ -150,6 +167,33 @@ def sideways(at: Stations) -> FloatArray:
     return np.where(at.side == 0, 1.0, -1.0)
 
 
+def outline_profiles(
+    cylinder: Cylinder,
+    views: Sequence[View],
+    others: Sequence[Cylinder],
+    basis: FloatArray,
+    view_offset: FloatArray,
+    reach: float,
+    blur: float,
+    chunk: int,
+) -> tuple[Stations, FloatArray, FloatArray]:
+    """Stations every `chunk` px on the predicted outlines, offsets (Q,) px and light (N, Q) around them.
+
+    Each profile is the mean over its chunk and starts from where the sideways `view_offset` (V,) px of its view puts
+    the outline. Stations behind one of the `others` are left out.
+    """
+    at = stations(cylinder, views, basis, chunk, margin=INWARD)
+    at = at.select(visible(cylinder, others, views, at))
+    inward = INWARD
+    if len(at):
+        inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(at.half_width)))
+    outward = OUTWARD + OUTWARD_OF_BLUR * blur
+    offsets = np.arange(-inward - reach, outward + 0.25, 0.5, dtype=float)
+    shift = sideways(at) * view_offset[at.view]
+    values = profiles(views, replace(at, pixel=at.pixel + shift[:, None] * at.normal), offsets, chunk)
+    return at, offsets, np.asarray(values, float)
+
+
 def outline_edges(
     cylinder: Cylinder,
     views: Sequence[View],
@@ -157,20 +201,49 @@ def outline_edges(
     basis: FloatArray,
     view_offset: FloatArray,
     reach: float,
+    blur: float,
     chunk: int,
 ) -> tuple[Stations, LimbEdges]:
-    """Stations every `chunk` px on the predicted outlines and the edges near them.
-
-    Each profile is the mean over its chunk; edges lie within `reach` px of where the sideways `view_offset` (V,) px of
-    each view puts the outline. Stations behind one of the `others` are left out.
-    """
-    at = stations(cylinder, views, basis, chunk, margin=INWARD)
-    at = at.select(visible(cylinder, others, views, at))
-    if not len(at):
-        return at, LimbEdges(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
-    inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(at.half_width)))
-    offsets = np.arange(-inward - reach, OUTWARD + 0.25, 0.5)
+    """Stations as in `outline_profiles` and the edges (from the predicted outline) within `reach` px of them."""
+    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, blur, chunk)
+    edges = limb_edges(values, offsets, at.half_width, blur, reach)
     shift = sideways(at) * view_offset[at.view]
-    values = profiles(views, replace(at, pixel=at.pixel + shift[:, None] * at.normal), offsets, chunk)
-    edges = limb_edges(values, offsets, at.half_width, BLUR, reach)
     return at, replace(edges, offset=edges.offset + shift[:, None])
+
+
+def estimate_blur(
+    cylinder: Cylinder,
+    views: Sequence[View],
+    others: Sequence[Cylinder],
+    basis: FloatArray,
+    view_offset: FloatArray,
+    chunk: int,
+) -> float:
+    """Blur of the images [px] by which the limb model explains the outlines best.
+
+    Surfaces only soften an edge further: of the best values of all views and sides the lowest tenth counts.
+    """
+    reach = 0.8
+    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, 1.0, chunk)
+    if not len(at):
+        return SHARP
+    chosen = np.arange(0, len(at), max(len(at) // 600, 1))
+    at, values = at.select(chosen), values[chosen]
+    trials = np.arange(-reach, reach + 0.1, 0.2, dtype=float)
+    left = [_costs(values, offsets, at.half_width, float(blur), trials).min(axis=1) for blur in BLURS]
+    cost = np.log(np.stack(left) / _smooth_cost(values, offsets) + 1e-4)
+    clear = cost.min(axis=0) < np.log(0.4)
+    outline = 2 * at.view + at.side
+    best = []
+    for one in np.unique(outline[clear]):
+        members = clear & (outline == one)
+        if members.sum() >= 4:
+            best.append(_lowest(np.log(BLURS), cost[:, members].sum(axis=1)))
+    return float(np.exp(np.quantile(best, 0.1))) if len(best) >= 3 else SHARP
+
+
+def _lowest(x: FloatArray, cost: FloatArray) -> float:
+    """Where the parabola through the least of cost (T,) at x (T,) and its neighbours is lowest."""
+    middle = int(np.clip(np.argmin(cost), 1, len(x) - 2))
+    square, slope, _ = np.polyfit(x[middle - 1 : middle + 2], cost[middle - 1 : middle + 2], 2)
+    return float(np.clip(-0.5 * slope / square, x[0], x[-1])) if square > 0 else float(x[np.argmin(cost)])

@@ -37,6 +37,7 @@ def find_end(
     others: Sequence[Cylinder],
     basis: FloatArray,
     view_offset: FloatArray,
+    blur: float,
 ) -> End | None:
     """The end of the straight barrel near the given one, or None where the images do not tell.
 
@@ -50,10 +51,10 @@ def find_end(
     inside = min(outside, 0.6 * cylinder.length)
     distances = [np.linalg.norm(end - camera_centre(view)) for view in views]
     pixel = float(np.median(distances)) / views[0].camera.fx
-    position, contrast = _contrast(cylinder, axis, end, inside, outside, pixel, views, others, basis, view_offset)
+    position, contrast = _contrast(cylinder, axis, end, inside, outside, pixel, views, others, basis, view_offset, blur)
     if not len(position) or contrast.max() < MIN_CONTRAST:
         return None
-    along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL)
+    along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL, dtype=float)
     slopes = [_slopes(axis, end, cylinder.radius, along, view) for view in views]
     edges = np.concatenate(slopes) if slopes else np.zeros((0, len(along)))
     seen = np.isfinite(edges)
@@ -81,10 +82,11 @@ def _contrast(
     others: Sequence[Cylinder],
     basis: FloatArray,
     view_offset: FloatArray,
+    blur: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Positions along `axis` from `end` and how much the support of the outlines falls there."""
     stretch = Cylinder(end - inside * axis, end + outside * axis, cylinder.radius)
-    at, edges = outline_edges(stretch, views, others, basis, view_offset, 1.5, 6)
+    at, edges = outline_edges(stretch, views, others, basis, view_offset, 1.5, blur, 6)
     if not len(at):
         return np.zeros(0), np.zeros(0)
     profile = support_profile(at, hits(at, edges, view_offset))

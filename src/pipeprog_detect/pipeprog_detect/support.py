@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_detect.edges import LimbEdges, outline_edges, sideways
+from pipeprog_detect.edges import SHARP, LimbEdges, outline_edges, sideways
 from pipeprog_detect.outline import Stations, frame, viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 
@@ -25,8 +25,8 @@ class SupportProfile:
     """Support by position: `along` (B,) from the cylinder's middle [m], and for each side (B, 2) views and hits."""
 
     along: FloatArray
-    seen: FloatArray
-    hits: FloatArray
+    seen: NDArray[np.floating]
+    hits: NDArray[np.floating]
 
     @property
     def share(self) -> float:
@@ -40,15 +40,15 @@ def hits(at: Stations, edges: LimbEdges, view_offset: FloatArray) -> NDArray[np.
     """Mask (N,) of the stations whose outline an edge supports."""
     distance = np.abs(edges.offset - (sideways(at) * view_offset[at.view])[:, None])
     good = (distance < NEAR) & (edges.sigma < SIGMA) & (edges.explained > EXPLAINED)
-    return good.any(axis=1)
+    return np.asarray(good.any(axis=1), bool)
 
 
 def support_profile(at: Stations, hit: NDArray[np.bool_]) -> SupportProfile:
     """Hits counted by position along the axis and side."""
     along, place = np.unique(np.round(at.along, 6), return_inverse=True)
     cell = 2 * place + at.side
-    seen = np.bincount(cell, minlength=2 * len(along)).reshape(-1, 2).astype(float)
-    found = np.bincount(cell, hit, 2 * len(along)).reshape(-1, 2)
+    seen = np.bincount(cell, np.ones(len(cell)), 2 * len(along)).reshape(-1, 2)
+    found = np.bincount(cell, hit.astype(float), 2 * len(along)).reshape(-1, 2)
     return SupportProfile(along, seen, found)
 
 
@@ -59,5 +59,5 @@ def support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder
     """
     basis = frame(cylinder, viewing_direction(cylinder, views))
     none = np.zeros(len(views))
-    at, edges = outline_edges(cylinder, views, others, basis, none, 1.5, chunk)
+    at, edges = outline_edges(cylinder, views, others, basis, none, 1.5, SHARP, chunk)
     return support_profile(at, hits(at, edges, none)).share if len(at) else 0.0

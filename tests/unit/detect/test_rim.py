@@ -22,7 +22,7 @@ def test_rim_is_found(pipe_views: list[View], at_end: bool, error: float) -> Non
     axis = PIPE.axis
     start = PIPE.start - (0.0 if at_end else error) * axis
     end = PIPE.end + (error if at_end else 0.0) * axis
-    found = find_end(Cylinder(start, end, PIPE.radius), at_end, pipe_views, [], BASIS, np.zeros(len(pipe_views)))
+    found = find_end(Cylinder(start, end, PIPE.radius), at_end, pipe_views, [], BASIS, np.zeros(len(pipe_views)), 0.5)
     assert found is not None
     assert found.position == pytest.approx(-error, abs=END_TOLERANCE)
     assert abs(found.position + error) < 3.0 * found.sigma < 0.01
@@ -31,6 +31,6 @@ def test_rim_is_found(pipe_views: list[View], at_end: bool, error: float) -> Non
 def test_no_end_where_the_pipe_goes_on_or_leaves_the_images(pipe_views: list[View]) -> None:
     still = np.zeros(len(pipe_views))
     inner = Cylinder(PIPE.start, PIPE.start + 0.02 * PIPE.axis, PIPE.radius)
-    assert find_end(inner, True, pipe_views, [], BASIS, still) is None
+    assert find_end(inner, True, pipe_views, [], BASIS, still, 0.5) is None
     beyond = Cylinder(PIPE.start, PIPE.end + 1.0 * PIPE.axis, PIPE.radius)
-    assert find_end(beyond, True, pipe_views, [], BASIS, still) is None
+    assert find_end(beyond, True, pipe_views, [], BASIS, still, 0.5) is None
