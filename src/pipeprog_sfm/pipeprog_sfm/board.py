@@ -5,9 +5,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -21,6 +23,8 @@ from pipeprog_sfm.ellipse import PROFILES, TargetEllipses
 
 LEAST_CIRCLES = 3  # circles that identify a board: fewer agree by chance
 MAX_CANDIDATES = 400  # ellipses considered in one image: a perforated sheet must not stall the search
+MAX_HYPOTHESES = 20000  # poses from pairs of ellipses, likewise
+MAX_TRIALS = 200  # hypotheses looked at closely for one layout in one image
 SAME_PLACE = 0.1  # of a circle's radius: circles of two layouts closer than that are the same circle
 
 
@@ -200,10 +204,10 @@ def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) 
     free[best] = True
     matrix, found = camera.matrix, []
     for board in (group[0] for group in layouts(boards)):
-        for pose, circles, members in _hypotheses(ellipses, free, board, matrix):
+        for circles, members in islice(_hypotheses(ellipses, free, board, matrix), MAX_TRIALS):
             if not free[members].all():
                 continue
-            fit = _verify(ellipses, free, board, camera, pose, circles, members)
+            fit = _verify(ellipses, free, board, camera, circles, members)
             if fit is not None:
                 pose, circles, members = fit
                 free[members] = False
@@ -255,8 +259,8 @@ def _observation(
 
 def _hypotheses(
     ellipses: TargetEllipses, free: NDArray[np.bool_], board: Board, matrix: FloatArray
-) -> Iterator[tuple[FloatArray, NDArray[np.intp], NDArray[np.intp]]]:
-    """Poses of the board from pairs of ellipses, with the circles that they explain; the best first."""
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Circles of the board and the ellipses that a pose from a pair of ellipses explains them by; the best first."""
     members = np.flatnonzero(free)
     if len(members) < LEAST_CIRCLES:
         return
@@ -290,6 +294,7 @@ def _hypotheses(
         pose[:, :3, 3] = middle - pose[:, :3, :3] @ (0.5 * (board.centres[first] + board.centres[second]))
         poses.append(pose)
     stack = np.concatenate(poses)
+    stack = stack[:: len(stack) // MAX_HYPOTHESES + 1]
     predicted = board.centres @ stack[:, :3, :3].transpose(0, 2, 1) + stack[:, None, :3, 3]
     depths = np.maximum(predicted[..., 2], 1e-6)
     pixels = (predicted / depths[..., None]) @ matrix[:2].T
@@ -307,7 +312,7 @@ def _hypotheses(
         key = np.r_[circles, chosen].tobytes()
         if key not in seen and len(set(chosen)) == len(chosen):
             seen.add(key)
-            yield stack[index], circles, chosen
+            yield circles, chosen
 
 
 def _verify(
@@ -315,27 +320,30 @@ def _verify(
     free: NDArray[np.bool_],
     board: Board,
     camera: Camera,
-    pose: FloatArray,
     circles: NDArray[np.intp],
     members: NDArray[np.intp],
 ) -> tuple[FloatArray, NDArray[np.intp], NDArray[np.intp]] | None:
-    """The refined pose, its circles and their ellipses, or None where they do not form the board."""
+    """The refined pose, its circles and their ellipses, or None where they do not form the board.
+
+    The centres of three circles give up to four poses, and each predicts three whole ellipses: nine numbers to be
+    refuted by. What survives is refined and has to fit in every circle.
+    """
     matrix = camera.matrix
-    # A plane seen from afar has two poses that look nearly alike: mirrored at the line of sight. Try both.
-    sight = pose[:3, 3] / np.linalg.norm(pose[:3, 3])
-    mirrored = pose.copy()
-    mirrored[:3, :3] = _rotation_between(pose[:3, 2], 2 * (pose[:3, 2] @ sight) * sight - pose[:3, 2]) @ pose[:3, :3]
-    fits = [_refine(ellipses, board, matrix, start, circles, members) for start in (pose, mirrored)]
-    pose = min(fits, key=lambda fit: fit[1])[0]
+    triple = list(max(combinations(range(len(circles)), 3), key=lambda rows: _area(board.centres[circles[list(rows)]])))
+    if _area(board.centres[circles[triple]]) < board.circle_radius**2:
+        return None
+    starts = _three_point_poses(board.centres[circles[triple]], ellipses.centres[members[triple]], matrix)
+    misfits = [_misfit(ellipses, board, matrix, start, circles, members)[triple].max() for start in starts]
+    if not misfits or min(misfits) > 4.0:
+        return None
+    pose = starts[int(np.argmin(misfits))]
     circles, members = _matches(ellipses, free, board, matrix, pose, 0.25)
     while len(circles) >= LEAST_CIRCLES:
-        pose, _ = _refine(ellipses, board, matrix, pose, circles, members)
-        centres, shapes = project_circles(matrix, pose, board.centres[circles], board.circle_radius)
-        radii = np.sqrt(np.sqrt(np.abs(np.linalg.det(shapes))))
-        errors = np.linalg.norm(centres - ellipses.centres[members], axis=1) / np.maximum(0.06 * radii, 1.0)
-        if errors.max() <= 1.0:
+        pose = _refine(ellipses, board, matrix, pose, circles, members)
+        misfit = _misfit(ellipses, board, matrix, pose, circles, members)
+        if misfit.max() <= 1.0:
             break
-        circles, members = np.delete(circles, errors.argmax()), np.delete(members, errors.argmax())
+        circles, members = np.delete(circles, misfit.argmax()), np.delete(members, misfit.argmax())
     if len(circles) < LEAST_CIRCLES:
         return None
     # Circles that the image should show as well but does not: some may be hidden, not most of them.
@@ -343,6 +351,44 @@ def _verify(
     reach = np.sqrt(np.abs(shapes[:, [0, 1], [0, 1]])) + 4.0
     within = ((centres > reach) & (centres < np.array([camera.width, camera.height]) - reach)).all(1)
     return (pose, circles, members) if 2 * len(circles) > within.sum() else None
+
+
+def _area(corners: FloatArray) -> float:
+    """Area of a triangle (3, 3) in the plane z = 0."""
+    (ax, ay), (bx, by) = corners[1, :2] - corners[0, :2], corners[2, :2] - corners[0, :2]
+    return 0.5 * abs(float(ax * by - ay * bx))
+
+
+def _three_point_poses(points: FloatArray, pixels: FloatArray, matrix: FloatArray) -> list[FloatArray]:
+    """Poses camera_from_board that see three points in three pixels, with the board's front to the camera."""
+    _, turns, shifts = cv2.solveP3P(points[:, None], pixels[:, None], matrix, None, cv2.SOLVEPNP_AP3P)
+    poses = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        if np.isfinite(pose).all() and pose[:3, 2] @ pose[:3, 3] < 0 < pose[2, 3]:
+            poses.append(pose)
+    return poses
+
+
+def _misfit(
+    ellipses: TargetEllipses,
+    board: Board,
+    matrix: FloatArray,
+    pose: FloatArray,
+    circles: NDArray[np.intp],
+    members: NDArray[np.intp],
+) -> FloatArray:
+    """(K,) how far ellipses are from what the pose predicts; up to 1 is agreement.
+
+    Allowed are, for a centre, half a pixel or 3 % of the radius (lens, print), and for the outline one pixel or 5 %
+    (exposure makes bright discs larger).
+    """
+    centres, shapes = project_circles(matrix, pose, board.centres[circles], board.circle_radius)
+    radii = np.sqrt(np.sqrt(np.abs(np.linalg.det(shapes))))
+    gaps = np.linalg.norm(centres - ellipses.centres[members], axis=1) / np.maximum(0.03 * radii, 0.5)
+    bends = np.linalg.norm(shapes - ellipses.shapes[members], axis=(1, 2)) / (2 * radii)
+    return np.maximum(gaps, bends / np.maximum(0.05 * radii, 1.0))
 
 
 def _matches(
@@ -373,8 +419,8 @@ def _refine(
     pose: FloatArray,
     circles: NDArray[np.intp],
     members: NDArray[np.intp],
-) -> tuple[FloatArray, float]:
-    """The pose that fits the ellipses best (damped Gauss-Newton), and its cost.
+) -> FloatArray:
+    """The pose that fits the ellipses best (damped Gauss-Newton).
 
     Residuals are the centres, to 0.1 px, and the shapes, to 0.5 px: the size of a disc suffers from exposure.
     """
@@ -406,7 +452,7 @@ def _refine(
             damping *= 10
             if damping > 1e6:
                 break
-    return pose, float(current @ current)
+    return pose
 
 
 def _moved(pose: FloatArray, change: FloatArray) -> FloatArray:
@@ -415,15 +461,6 @@ def _moved(pose: FloatArray, change: FloatArray) -> FloatArray:
     moved[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ pose[:3, :3]
     moved[:3, 3] += change[3:]
     return moved
-
-
-def _rotation_between(start: FloatArray, end: FloatArray) -> FloatArray:
-    """(3, 3) least rotation that takes one unit vector to another."""
-    axis = np.cross(start, end)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-9:
-        return np.eye(3)
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, start @ end)).as_matrix()
 
 
 def _upright(board: Board, pose: FloatArray, circles: NDArray[np.intp]) -> tuple[FloatArray, NDArray[np.intp]]:

@@ -28,7 +28,7 @@ class BoardConfig:
         metadata={"description": "smallest image of a circle that is looked for", "unit": "px", "range": (3.0, 100.0)},
     )
     tolerance: float = field(
-        default=0.0001,
+        default=0.00005,
         metadata={
             "description": "standard deviation of a circle's place on the real board against its file",
             "unit": "m",
