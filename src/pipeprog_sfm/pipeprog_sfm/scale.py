@@ -196,8 +196,9 @@ def _places(
         place = _adjusted(board, chosen, start, poses, camera, config)
         if ellipses is not None:
             place = _completed(place, poses, camera, config, ellipses)
-        taken = {view.stamp for view in place.views}
-        views = [view for index, view in enumerate(views) if index not in members and view.stamp not in taken]
+        taken = {(view.stamp, *centre) for view in place.views for centre in view.seen.ellipse_centres}
+        left = [view for index, view in enumerate(views) if index not in members]
+        views = [view for view in left if not any((view.stamp, *xy) in taken for xy in view.seen.ellipse_centres)]
         if place.sigma <= LARGEST_SIGMA and (not places or abs(place.scale / places[0].scale - 1) < 0.05):
             places.append(place)
     return places

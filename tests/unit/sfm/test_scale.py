@@ -1,0 +1,173 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from targets import BOARD, CAMERA, LOPSIDED, camera_from_board, exact_ellipses, render
+
+from pipeprog_sfm.board import Board, identify
+from pipeprog_sfm.board_tracker import BoardTracker
+from pipeprog_sfm.config import BoardConfig
+from pipeprog_sfm.scale import NoScaleError, estimate_scale, similarity
+
+CONFIG = BoardConfig()
+AT_ORIGIN = (BOARD, np.eye(4))
+
+
+class Walk:
+    """A camera that walks past boards in a world of metres, and a model that is that world up to a similarity."""
+
+    def __init__(self, seed, views=8, noise=0.0, pose_noise=0.0, boards=(AT_ORIGIN,), span=1.6, follow=0.6, roll=0.0):
+        rng = np.random.default_rng(seed)
+        self.factor = rng.uniform(0.2, 5.0)  # model units per metre
+        self.model_from_board = np.eye(4)
+        self.model_from_board[:3, :3] = self.factor * Rotation.random(random_state=seed).as_matrix()
+        self.model_from_board[:3, 3] = rng.normal(0, 3, 3)
+        self.poses, self.ellipses = {}, {}
+        for stamp in range(views):
+            x = span * (stamp / max(views - 1, 1) - 0.5)
+            pose = camera_from_board((x, rng.normal(0, 0.1), 1.6 + rng.normal(0, 0.1)), (follow * x, 0, 0), roll)
+            seen = [pose @ place for _, place in boards]
+            self.ellipses[stamp] = exact_ellipses([board for board, _ in boards], seen, noise=noise, rng=rng)
+            moved = pose.copy()
+            moved[:3, 3] += rng.normal(0, pose_noise, 3)
+            self.poses[stamp] = self.in_model(moved)
+
+    def in_model(self, camera_from_board_pose):
+        pose = np.eye(4)
+        pose[:3, :3] = camera_from_board_pose[:3, :3] @ self.model_from_board[:3, :3].T / self.factor
+        centre = -camera_from_board_pose[:3, :3].T @ camera_from_board_pose[:3, 3]
+        pose[:3, 3] = -pose[:3, :3] @ (self.model_from_board[:3, :3] @ centre + self.model_from_board[:3, 3])
+        return pose
+
+    def estimate(self, boards=(BOARD,), config=CONFIG):
+        seen = {stamp: identify(ellipses, boards, CAMERA) for stamp, ellipses in self.ellipses.items()}
+        return estimate_scale(seen, self.poses, CAMERA, boards, config, self.ellipses)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**16))
+def test_similarity_is_found_from_its_points(seed):
+    rng = np.random.default_rng(seed)
+    true = np.eye(4)
+    true[:3, :3] = rng.uniform(0.1, 10) * Rotation.random(random_state=seed).as_matrix()
+    true[:3, 3] = rng.normal(0, 5, 3)
+    points = np.c_[rng.normal(0, 1, (6, 2)), np.zeros(6)]
+    assert similarity(points, points @ true[:3, :3].T + true[:3, 3]) == pytest.approx(true, abs=1e-8)
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**16))
+def test_exact_images_give_the_exact_scale_and_frame(seed):
+    walk = Walk(seed)
+    estimate = walk.estimate()
+    assert estimate.scale * walk.factor == pytest.approx(1.0, abs=1e-6)
+    board_in_map = estimate.map_from_model @ walk.model_from_board
+    # x along the board, y into the wall, z up; the origin is the board's.
+    assert board_in_map == pytest.approx(
+        np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]), abs=1e-5
+    )
+    assert estimate.placements[0].ratio_scale == pytest.approx(estimate.scale, rel=1e-6)
+
+
+def test_sigma_is_honest_at_the_noise_of_a_good_model():
+    """Chi-square of the scale's error over seeds: centres 0.1 px, camera places 0.5 mm."""
+    scores = []
+    for seed in range(24):
+        walk = Walk(seed, views=8, noise=0.1, pose_noise=0.0005)
+        placement = walk.estimate().placements[0]
+        scores.append((placement.scale * walk.factor - 1) / placement.sigma)
+    assert 0.4 < np.mean(np.square(scores)) < 2.0
+    assert np.abs(scores).max() < 4.0
+
+
+def test_sigma_holds_the_tolerance_of_the_board():
+    walk = Walk(1, noise=0.05, pose_noise=0.0003)
+    coarse = walk.estimate(config=replace(CONFIG, tolerance=0.002))
+    assert coarse.sigma == pytest.approx(np.hypot(coarse.placements[0].sigma, 0.002 / BOARD.spread))
+
+
+def test_uncorrected_centres_are_off_by_the_eccentricity():
+    walk = Walk(3, boards=((Board("A", 0.06, BOARD.centres), np.eye(4)),))
+    board = Board("A", 0.06, BOARD.centres)
+    corrected = walk.estimate((board,)).scale * walk.factor - 1
+    raw = walk.estimate((board,), replace(CONFIG, eccentricity=False)).scale * walk.factor - 1
+    assert abs(corrected) < 1e-6
+    assert 1e-5 < abs(raw) < 1e-2
+
+
+def test_images_with_one_circle_take_part():
+    walk = Walk(5, views=16, span=3.0, follow=1.0)
+    assert len(walk.estimate().views) > sum(len(one) >= 3 for one in walk.ellipses.values())
+
+
+def test_a_board_upside_down_in_all_images_is_turned_up():
+    walk = Walk(2, roll=np.pi)
+    z_of_board_up = (walk.estimate().map_from_model @ walk.model_from_board)[2, 1]
+    assert z_of_board_up == pytest.approx(-1.0, abs=1e-4)
+
+
+def test_a_lopsided_board_upside_down_is_warned_about():
+    walk = Walk(2, roll=np.pi, boards=((LOPSIDED, np.eye(4)),))
+    assert "upright" in walk.estimate((LOPSIDED,)).warnings[0]
+
+
+def test_boards_of_one_layout_are_told_apart_by_place():
+    apart = np.eye(4)
+    apart[0, 3] = 0.8
+    twins = (BOARD, replace(BOARD, name="twin"))
+    walk = Walk(4, views=12, noise=0.03, pose_noise=0.0003, span=3.0, boards=((BOARD, np.eye(4)), (BOARD, apart)))
+    estimate = walk.estimate(twins)
+    assert sorted(one.board for one in estimate.placements) == ["A", "twin"]
+    assert estimate.scale * walk.factor == pytest.approx(1.0, abs=5e-4)
+    gap = estimate.placements[1].model_from_board[:3, 3] - estimate.placements[0].model_from_board[:3, 3]
+    assert np.linalg.norm(gap) * estimate.scale == pytest.approx(0.8, abs=0.001)
+
+
+def test_an_image_with_a_wrong_pose_does_no_harm():
+    walk = Walk(6, views=10, noise=0.03, pose_noise=0.0003)
+    walk.poses[4][:3, 3] += 0.09 * walk.factor
+    estimate = walk.estimate()
+    assert 4 not in estimate.views
+    assert abs(estimate.scale * walk.factor - 1) < 5 * estimate.sigma
+
+
+def bent(offset):
+    centres = BOARD.centres.copy()
+    centres[1] += offset
+    return Board("A", BOARD.circle_radius, centres)
+
+
+@pytest.mark.parametrize("offset", [(0.003, 0, 0), (0, -0.012, 0), (0, 0, 0.006)])
+def test_a_board_that_contradicts_its_file_is_refused_with_the_residuals(offset):
+    walk = Walk(7, views=10, noise=0.03, pose_noise=0.0003, boards=((bent(offset), np.eye(4)),))
+    with pytest.raises(NoScaleError, match=r"2: \d+\.\d\d mm") as caught:
+        walk.estimate()
+    assert caught.value.reason == "contradiction"
+
+
+def test_reasons_for_no_scale():
+    walk = Walk(8)
+    with pytest.raises(NoScaleError, match="no board file") as caught:
+        estimate_scale({}, walk.poses, CAMERA, [], CONFIG)
+    with pytest.raises(NoScaleError, match="B") as caught:
+        walk.estimate((LOPSIDED,))
+    assert caught.value.reason == "no_board"
+    walk.poses = {0: walk.poses[0]}
+    with pytest.raises(NoScaleError) as caught:
+        walk.estimate()
+    assert caught.value.reason == "too_few_views"
+    with pytest.raises(NoScaleError, match="no keyframe"):
+        BoardTracker([BOARD], CONFIG).estimate({})
+
+
+def test_tracker_measures_rendered_images():
+    tracker, places, walk = BoardTracker([BOARD], CONFIG), (-0.6, 0.0, 0.6), Walk(9)
+    poses = {}
+    for stamp, x in enumerate(places):
+        pose = camera_from_board((x, 0.05, 1.3), (0.3 * x, 0, 0))
+        assert len(tracker.add(stamp, render(BOARD, pose, seed=stamp), CAMERA)) == 1
+        poses[stamp] = walk.in_model(pose)
+    assert tracker.estimate(poses).scale * walk.factor == pytest.approx(1.0, abs=5e-4)
