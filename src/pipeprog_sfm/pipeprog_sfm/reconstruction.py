@@ -115,7 +115,7 @@ class Reconstruction:
     def status(self) -> Status:
         """Health so far."""
         registered = len(self._mapper.camera_from_model())
-        message = self._problem or ("" if self._scale else self._reason)
+        message = self._problem or ("; ".join(self._scale.warnings) if self._scale else self._reason)
         return Status(
             self._mapper.seen,
             registered,
