@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 from numba import njit
@@ -18,9 +17,6 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-LOSS_SCALE = 1.0  # px, of the Cauchy loss: about twice the noise of a SIFT keypoint
-DENSE_VIEWS = 150  # up to this many free views a dense factorisation is the faster one
 
 
 @dataclass(frozen=True)
@@ -45,6 +41,7 @@ def adjust(
     rays: FloatArray,
     focal: FloatArray,
     *,
+    loss_scale: float,
     max_iterations: int,
     tolerance: float,
 ) -> Adjusted:
@@ -52,19 +49,19 @@ def adjust(
 
     rotation (C, 3, 3), translation (C, 3): camera_from_world; free (C,): views that may move.
     points (P, 3); observations sorted by point, those of point p in start[p]:start[p + 1], as view (K,) and
-    rays (K, 2), normalised image coordinates; focal (C, 2) px. Ends when an iteration gains less than `tolerance` of
+    rays (K, 2), normalised image coordinates; focal (C, 2) px; loss_scale px, of the Cauchy loss. Ends when an iteration gains less than `tolerance` of
     the cost.
     """
     index = np.where(free, np.cumsum(free) - 1, -1)
     count = int(free.sum())
     pairs, pair_row, pair_column = _pairs(start, view, index, count)
     rotation, translation, points = rotation.copy(), translation.copy(), points.copy()
-    cost = initial = _cost(rotation, translation, points, start, view, rays, focal)
+    cost = initial = _cost(rotation, translation, points, start, view, rays, focal, loss_scale)
     damping = 1e-4
     iteration = 0
     while iteration < max_iterations:
         iteration += 1
-        u, gc, v, gp, w = _linearise(rotation, translation, points, start, view, index, rays, focal, count)
+        u, gc, v, gp, w = _linearise(rotation, translation, points, start, view, index, rays, focal, count, loss_scale)
         gained = 0.0
         for _ in range(6):
             blocks, gradient, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(pair_row), damping)
@@ -72,7 +69,7 @@ def adjust(
             moves = _back_substitute(step.reshape(-1, 6), gp, w, v_inverse, start, view, index)
             new_rotation, new_translation = _move(rotation, translation, index, step.reshape(-1, 6))
             new_points = points + moves
-            new_cost = _cost(new_rotation, new_translation, new_points, start, view, rays, focal)
+            new_cost = _cost(new_rotation, new_translation, new_points, start, view, rays, focal, loss_scale)
             if new_cost < cost:
                 gained = cost - new_cost
                 rotation, translation, points, cost = new_rotation, new_translation, new_points, new_cost
@@ -85,16 +82,14 @@ def adjust(
 
 
 def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatArray) -> FloatArray:
-    """Solves the symmetric system given by its upper (6, 6) blocks."""
+    """Solves the symmetric system given by its upper (6, 6) blocks.
+
+    Sparse even where it is small and full: a dense solver's threads cost more than they gain, and their number would
+    show in the last bits.
+    """
     count = len(gradient)
     if not count:
         return np.zeros(0)
-    if count <= DENSE_VIEWS:
-        dense = np.zeros((count, 6, count, 6))
-        dense[row, :, column, :] = blocks
-        matrix = dense.reshape(6 * count, 6 * count)
-        factor = scipy.linalg.cho_factor(matrix, lower=False, overwrite_a=True, check_finite=False)
-        return scipy.linalg.cho_solve(factor, gradient.ravel(), check_finite=False)
     off = row != column
     data = np.concatenate([blocks, blocks[off].transpose(0, 2, 1)])
     rows, columns = np.concatenate([row, column[off]]), np.concatenate([column, row[off]])
@@ -161,9 +156,9 @@ def _pairs(start, view, index, count):  # type: ignore[no-untyped-def]  # compil
 
 
 @njit(cache=True, nogil=True)
-def _cost(rotation, translation, points, start, view, rays, focal):  # type: ignore[no-untyped-def]  # compiled
+def _cost(rotation, translation, points, start, view, rays, focal, loss_scale):  # type: ignore[no-untyped-def]  # compiled
     total = 0.0
-    scale = LOSS_SCALE * LOSS_SCALE
+    scale = loss_scale * loss_scale
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         for k in range(start[p], start[p + 1]):
@@ -180,7 +175,7 @@ def _cost(rotation, translation, points, start, view, rays, focal):  # type: ign
 
 
 @njit(cache=True, nogil=True)
-def _linearise(rotation, translation, points, start, view, index, rays, focal, count):  # type: ignore[no-untyped-def]  # compiled
+def _linearise(rotation, translation, points, start, view, index, rays, focal, count, loss_scale):  # type: ignore[no-untyped-def]  # compiled
     """Blocks of the weighted normal equations; gradients are those of the descent direction."""
     u = np.zeros((count, 6, 6))
     gc = np.zeros((count, 6))
@@ -207,7 +202,7 @@ def _linearise(rotation, translation, points, start, view, index, rays, focal, c
             residual[0] = focal[c, 0] * (a - rays[k, 0])
             residual[1] = focal[c, 1] * (b - rays[k, 1])
             square = residual[0] * residual[0] + residual[1] * residual[1]
-            weight = 1.0 / (1.0 + square / (LOSS_SCALE * LOSS_SCALE))
+            weight = 1.0 / (1.0 + square / (loss_scale * loss_scale))
             fu, fv = focal[c, 0] * inverse, focal[c, 1] * inverse
             for i in range(3):
                 jp[0, i] = fu * (r[0, i] - a * r[2, i])

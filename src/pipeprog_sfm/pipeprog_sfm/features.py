@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 
+PIXELS = 600_000  # of the image that is searched: finer detail is mostly noise, and SIFT looks at twice this resolution
 CONTRAST = 0.02  # a third of it per scale layer is the usual SIFT peak threshold of 0.0067
 TILES = (16, 9)  # the strongest of each tile come first, so that a thinly textured part of the image is heard
 
@@ -35,15 +36,20 @@ def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Fe
 
     RootSIFT (Arandjelovic and Zisserman, CVPR 2012).
     """
-    sift = cv2.SIFT_create(nfeatures=2 * config.max_features, contrastThreshold=CONTRAST, enable_precise_upscale=True)
-    found, descriptors = sift.detectAndCompute(gray, None)
+    factor = 0.5 if gray.size > PIXELS else 1.0
+    small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else gray
+    sift = cv2.SIFT_create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    found = sift.detect(small, None)
     if not found:
         return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8))
-    pixels = np.array([keypoint.pt for keypoint in found], np.float32)
+    places = np.array([keypoint.pt for keypoint in found], np.float32)
     response = np.array([keypoint.response for keypoint in found])
-    chosen = _spread(pixels, response, gray.shape)[: config.max_features]
-    keypoints = camera.undistort_points(pixels[chosen]).astype(np.float32)
-    return Features(keypoints, root_sift(descriptors[chosen]))
+    chosen = _spread(places, response, small.shape)[: config.max_features]
+    kept, descriptors = sift.compute(small, [found[index] for index in chosen])
+    places = np.array([keypoint.pt for keypoint in kept], np.float32)
+    pixels = (places + 0.5) / factor - 0.5
+    keypoints = camera.undistort_points(pixels).astype(np.float32)
+    return Features(keypoints, root_sift(descriptors))
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

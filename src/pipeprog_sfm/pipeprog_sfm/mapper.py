@@ -393,7 +393,7 @@ class Mapper:
             model.adjust(window, 10, 1e-3)
 
     def _adjust_globally(self, model: SparseModel) -> None:
-        model.adjust(None, 30, 1e-4)
+        model.adjust(None, 10, 1e-3)
         self._adjusted[id(model)] = len(model)
 
     def _complete(self, model: SparseModel) -> None:

@@ -16,6 +16,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MAX_ERROR = 3.0  # px: the noise of SIFT is below 1 px, wrong matches are uniform in the search range
+NOISE_RANGE = (0.1, 1.0)  # px, of a coordinate: what image noise and SIFT's localisation allow
+CAUCHY = 2.385  # scale of the loss in standard deviations for 95 % efficiency under normal noise (Holland, Welsch 1977)
+RAYLEIGH_MEDIAN = 1.1774  # of an error's length, in standard deviations of a coordinate
 MIN_ANGLE = np.radians(1.5)  # between the rays of a point: depth is known to a few per cent at 0.5 px
 NONE = -1
 
@@ -34,6 +37,7 @@ class SparseModel:
         self.translation = np.empty((0, 3))
         self.focal = np.empty((0, 2))
         self.points = np.empty((0, 3))
+        self.noise = NOISE_RANGE[1]
         self._rays = np.empty((0, 2))
         self._view_of = np.empty(0, np.int32)
         self._point_of = np.empty(0, np.int64)
@@ -147,10 +151,13 @@ class SparseModel:
         used, view = np.unique(self.view_of[features], return_inverse=True)
         result = adjust(
             self.rotation[used], self.translation[used], free[used], self.points[ids], start, view.astype(np.int64),
-            self.rays[features], self.focal[used], max_iterations=max_iterations, tolerance=tolerance,
+            self.rays[features], self.focal[used], loss_scale=CAUCHY * self.noise, max_iterations=max_iterations, tolerance=tolerance,
         )  # fmt: skip
         self.rotation[used], self.translation[used] = result.rotation, result.translation
         self.points[ids] = result.points
+        if views is None:
+            error = float(np.median(self.errors(features))) / RAYLEIGH_MEDIAN
+            self.noise = min(max(error, NOISE_RANGE[0]), NOISE_RANGE[1])
         self.filter(ids, start, features)
 
     def filter(self, ids: IntArray, start: IntArray, features: IntArray) -> None:
