@@ -135,6 +135,25 @@ def score(
         print_score(figures)
 
 
+@app.command(rich_help_panel="From results")
+def report(
+    folders: Annotated[
+        list[Path], typer.Argument(help="Results of one survey, or of several.", metavar="DIR [DIR ...]")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="The page to write (.html), or a folder for it.", metavar="REPORT")
+    ],
+    force: Annotated[bool, typer.Option("--force", help="Replace the page that --out names.")] = False,
+) -> None:
+    """Write one HTML page: progress of each class, pictures, trajectory, radii, all pipes."""
+    from pipeprog_bringup.console import share_bar
+    from pipeprog_bringup.report import report as write
+
+    with share_bar("report") as show:
+        target = write(folders, out, force, show)
+    typer.echo(f"Report: {target}")
+
+
 def main() -> None:
     """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
     from pipeprog_bringup.graph import NodeFailure

@@ -22,10 +22,11 @@ _NORMALS = ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz")
 
 @dataclass(frozen=True)
 class CloudFile:
-    """The cloud of a file, less `dropped` points that were not finite."""
+    """The cloud of a file, less `dropped` points that were not finite; colours (N, 3) where a PLY has them."""
 
     cloud: Cloud
     dropped: int
+    colors: NDArray[np.uint8] | None = None
 
 
 def read_cloud(path: Path) -> CloudFile:
@@ -95,7 +96,14 @@ def _cloud_file(path: Path, columns: dict[str, NDArray]) -> CloudFile:
             f"{path}: every coordinate is a whole number, and metres in whole numbers hold no pipe: "
             "export it in metres with decimals (millimetres: divide by 1000)"
         )
-    return CloudFile(Cloud(points, _normals(columns, finite)), dropped)
+    return CloudFile(Cloud(points, _normals(columns, finite)), dropped, _colors(columns, finite))
+
+
+def _colors(columns: dict[str, NDArray], finite: NDArray[np.bool_]) -> NDArray[np.uint8] | None:
+    names = ("red", "green", "blue")
+    if not all(name in columns and columns[name].dtype == np.uint8 for name in names):
+        return None
+    return np.stack([columns[name][finite] for name in names], axis=1)
 
 
 def _normals(columns: dict[str, NDArray], finite: NDArray[np.bool_]) -> FloatArray | None:

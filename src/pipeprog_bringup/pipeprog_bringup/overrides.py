@@ -29,7 +29,7 @@ def effective(texts: Sequence[str], nodes: Sequence[str] = tuple(NODE_CONFIGS)) 
             raise InputError(f"--set {text}: {unknown(name.strip(), settings)}")
         node, setting = settings[name.strip()]
         try:
-            values[node][setting.name] = parse(value, setting)
+            values[node][setting.name] = parse(value.strip(), setting)
         except InputError as error:
             raise InputError(f"--set {text}: {error}") from None
     return {node: build(NODE_CONFIGS[node], values[node]) for node in nodes}

@@ -52,10 +52,9 @@ class FrameRow:
 
 
 def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress], scale: Scale) -> None:
-    """pipes.json; lengths rounded to the micrometre, so that it reads well and stays the same on every machine."""
-    content = {
-        "frame_id": "map",
-        "scale": {"source": scale.source, "sigma": _significant(scale.sigma)},
+    """pipes.json, one line a pipe; lengths rounded to the micrometre, far below what any measurement tells."""
+    head = {"frame_id": "map", "scale": {"source": scale.source, "sigma": _significant(scale.sigma)}}
+    rows = {
         "pipes": [_pipe_entry(pipe) for pipe in pipes],
         "classes": [
             {
@@ -68,7 +67,11 @@ def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgre
             for entry in classes
         ],
     }
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    parts = [json.dumps(head, allow_nan=False)[1:-1]]
+    for name, entries in rows.items():
+        lines = ",\n  ".join(json.dumps(entry, allow_nan=False) for entry in entries)
+        parts.append(f'"{name}": [' + (f"\n  {lines}" if lines else "") + "]")
+    path.write_text("{" + ",\n ".join(parts) + "}\n")
 
 
 def write_progress(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress]) -> None:

@@ -181,7 +181,7 @@ def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Traject
 
 def read_result(path: Path) -> Result:
     """The pipes.json of a run; raises InputError where it is none."""
-    content = _read_json(path)
+    content = read_json(path)
     try:
         pipes = tuple(_segment(path, pipe, str(pipe["id"]), pipe.get("class")) for pipe in content["pipes"])
         class_radii = {str(entry["class"]): float(entry["outer_radius"]) for entry in content["classes"]}
@@ -197,7 +197,7 @@ def read_result(path: Path) -> Result:
 
 def read_truth(path: Path) -> Truth:
     """A truth file; raises InputError where it is none."""
-    content = _read_json(path)
+    content = read_json(path)
     try:
         pipes = tuple(_segment(path, pipe, str(pipe.get("id", i))) for i, pipe in enumerate(content["pipes"]))
         ignore = tuple(_segment(path, pipe, "ignore") for pipe in content.get("ignore", []))
@@ -227,7 +227,8 @@ def _pairs(trajectory_file: Path, truth_json: Path, truth: Truth) -> tuple[Float
     return map_from_camera[near], truth.world_from_camera[first[nearest[near]]]
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; raises InputError where there is none."""
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:

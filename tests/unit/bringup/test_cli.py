@@ -1,0 +1,145 @@
+"""The command as its users meet it: a process, its exit code and its stderr."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeprog_bringup.cloud_io import write_ply
+from tests.unit.bringup.recordings import write_bag
+
+BOQ = "classes: [{name: DN65, outer_radius_mm: 36.5, planned_length_m: 3.0}]\n"
+
+
+def pipeprog(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pipeprog_bringup.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=120, check=False)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A bill, a recording, and a cloud of one pipe of 36.5 mm in front of a wall."""
+    (tmp_path / "boq.yaml").write_text(BOQ)
+    write_bag(tmp_path / "bag.mcap")
+    rng = np.random.default_rng(0)
+    turn, height = rng.uniform(-1.3, 1.3, 20_000), rng.uniform(0, 1.5, 20_000)
+    pipe = np.stack([0.0365 * np.sin(turn), -0.1 - 0.0365 * np.cos(turn), height], axis=1)
+    wall = rng.uniform([-0.5, -0.001, 0], [0.5, 0.001, 1.5], (40_000, 3))
+    write_ply(tmp_path / "cloud.ply", np.concatenate([pipe, wall]))
+    return tmp_path
+
+
+def test_help_is_instant() -> None:
+    pipeprog("--help")
+    taken = []
+    for _ in range(5):
+        before = os.times()
+        started = time.perf_counter()
+        result = pipeprog("--help")
+        after = os.times()
+        cpu = after.children_user + after.children_system - before.children_user - before.children_system
+        # On a busy machine the wall clock says little: what the process itself needed counts.
+        taken.append(min(time.perf_counter() - started, cpu))
+        assert result.returncode == 0
+    assert min(taken) < 0.5
+    for command in ("replay", "detect", "ingest", "score", "report"):
+        assert command in result.stdout
+
+
+def test_no_heavy_import_for_help() -> None:
+    code = "import sys, pipeprog_bringup.cli; print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "cv2", "rclpy", "scipy", "matplotlib", "mcap"} & set(modules)
+
+
+@pytest.mark.parametrize("arguments", [("--version",), ("replay", "--help"), ("score", "--help")])
+def test_help_and_version_end_well(arguments: tuple[str, ...]) -> None:
+    assert pipeprog(*arguments).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "arguments", [(), ("fly",), ("replay",), ("score", "a"), ("detect", "c.ply", "--nonsense"), ("report", "a")]
+)
+def test_wrong_usage_is_2(arguments: tuple[str, ...]) -> None:
+    result = pipeprog(*arguments)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+
+
+def test_detect_writes_its_results_and_says_where(folder: Path) -> None:
+    result = pipeprog("detect", folder / "cloud.ply", "--boq", folder / "boq.yaml", "--out", folder / "out")
+    assert result.returncode == 0, result.stderr
+    assert sorted(file.name for file in (folder / "out").iterdir()) == [
+        *("config.yaml", "pipes.json", "progress.csv", "run.json")
+    ]
+    content = json.loads((folder / "out" / "pipes.json").read_text())
+    assert [pipe["class"] for pipe in content["pipes"]] == ["DN65"]
+    assert "DN65" in result.stdout
+    assert "pipes.json" in result.stdout
+
+
+BAD = [
+    (("replay", "absent.mcap", "--boq", "boq.yaml", "--out", "out"), "no such bag: absent.mcap"),
+    (("replay", "boq.yaml", "--boq", "boq.yaml", "--out", "out"), "boq.yaml is not an mcap file"),
+    (("replay", "bag.mcap", "--boq", "absent.yaml", "--out", "out"), "absent.yaml"),
+    (("replay", "bag.mcap", "--boq", "bad.yaml", "--out", "out"), "bad.yaml"),
+    (("replay", "bag.mcap", "--boq", "boq.yaml", "--board", "bad.yaml", "--out", "out"), "bad.yaml"),
+    (("replay", "bag.mcap", "--boq", "boq.yaml", "--out", "used"), "used is not empty"),
+    (("replay", "bag.mcap", "--boq", "boq.yaml", "--out", "boq.yaml"), "boq.yaml is a file"),
+    (("replay", "bag.mcap", "--boq", "boq.yaml", "--out", "out", "--rate", "0"), "--rate 0"),
+    (
+        ("replay", "bag.mcap", "--boq", "boq.yaml", "--out", "out", "--set", "sfm.maper.max_features=3"),
+        "did you mean 'sfm.mapper.max_features'",
+    ),
+    (("replay", "bag.mcap", "--boq", "boq.yaml", "--out", "out", "--set", "frames.lockstep=false"), "lockstep"),
+    (("replay", "bag.mcap", "--boq", "boq.yaml", "--out", "out", "--image-topic", "/nope"), "/camera/image/compressed"),
+    (("detect", "absent.ply", "--boq", "boq.yaml", "--out", "out"), "no such cloud: absent.ply"),
+    (("detect", "cloud.ply", "--boq", "bad.yaml", "--out", "out"), "bad.yaml"),
+    (("detect", "cloud.ply", "--boq", "boq.yaml", "--out", "/proc/out"), "/proc/out"),
+    (
+        ("detect", "cloud.ply", "--boq", "boq.yaml", "--out", "out", "--set", "detect.sed=1"),
+        "did you mean 'detect.seed'",
+    ),
+    (("ingest", "absent.mp4", "--camera", "boq.yaml", "--out", "o.mcap"), "boq.yaml is no camera calibration"),
+    (("score", "absent.json", "boq.yaml"), "no such file: absent.json"),
+    (("report", "absent", "--out", "r.html"), "no such folder: absent"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "expected"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_is_1_and_says_what_is_wrong(folder: Path, arguments: tuple[str, ...], expected: str) -> None:
+    (folder / "bad.yaml").write_text("clases: []\n")
+    (folder / "used").mkdir()
+    (folder / "used" / "mine.txt").write_text("keep")
+    before = sorted(folder.rglob("*"))
+    result = pipeprog(*arguments, cwd=folder)
+    assert result.returncode == 1
+    assert expected in result.stderr
+    assert "Traceback" not in result.stderr
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(folder: Path) -> None:
+    """The second file fails to be written, as it would on a full disk."""
+    code = (
+        "import errno, pathlib, sys\n"
+        "from pipeprog_bringup import cli, results\n"
+        "def full(*arguments): raise OSError(errno.ENOSPC, 'No space left on device')\n"
+        "results.write_progress = full\n"
+        "sys.argv = ['pipeprog', *sys.argv[1:]]\n"
+        "cli.main()\n"
+    )
+    arguments = ["detect", "cloud.ply", "--boq", "boq.yaml", "--out", "out"]
+    result = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=folder, check=False
+    )
+    assert result.returncode == 1
+    assert "no space left for the results in out" in result.stderr
+    assert not (folder / "out").exists()

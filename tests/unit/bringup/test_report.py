@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeprog_bringup import picture, results
+from pipeprog_bringup.cloud_io import write_ply
+from pipeprog_bringup.report import report
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.classify import ClassProgress
+from pipeprog_detect.pipe import Cylinder, Pipe
+
+DAY = 86_400 * 10**9
+START = 1_700_000_000 * 10**9
+
+
+def cylinder(x: float, length: float = 2.0, radius: float = 0.1) -> Cylinder:
+    return Cylinder(np.array([x, 0.0, 0.0]), np.array([x, 0.0, length]), radius)
+
+
+def survey(folder: Path, day: int = 0, length: float = 2.0, name: str = "DN<200>") -> Path:
+    """Results of a run: a wall behind one pipe of a class and one of none."""
+    folder.mkdir(parents=True)
+    pipes = [
+        Pipe("p01", cylinder(0.0, length), 0.0002, name, 0.99, 2.5, 0.001, 900),
+        Pipe("p02", cylinder(0.8), 0.0002, None, 0.0, 2.5, 0.001, 900),
+    ]
+    classes = [ClassProgress(name, 0.1, 4.0, length, 25 * length)]
+    results.write_pipes(folder / "pipes.json", pipes, classes, results.Scale("board", 0.0004))
+    wall = np.random.default_rng(0).uniform([-1, 0.15, -0.5], [2, 0.16, 2.5], (20_000, 3))
+    write_ply(folder / "cloud.ply", wall, np.full((20_000, 3), 120, np.uint8))
+    stamps = [START + day * DAY + i * 10**8 for i in range(5)]
+    positions = np.c_[np.linspace(-1, 1, 5), np.full(5, -2.0), np.full(5, 1.5)]
+    results.write_trajectory(folder / "trajectory.tum", stamps, positions, np.tile([0.0, 0, 0, 1], (5, 1)))
+    config = {"boq": [{"name": name, "color": "#ff0000"}]}
+    results.write_config(folder / "config.yaml", config)
+    (folder / "run.json").write_text(json.dumps({"frames_considered": 40, "keyframes": 5, "losses": ["bag <torn>"]}))
+    return folder
+
+
+class Balanced(HTMLParser):
+    """Collects the page's text, and fails where a tag is not closed."""
+
+    VOID = ("meta", "img", "br", "link", "path", "use", "rect")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeprog_bringup.report.PICTURE_WIDTH", 200)
+
+
+def silent(share: float, stage: str) -> None:
+    pass
+
+
+def read(path: Path) -> tuple[str, str]:
+    page = path.read_text()
+    parser = Balanced()
+    parser.feed(re.sub(r"<(path|use|rect)\b([^>]*[^/])?></\1>|<(path|use|rect)\b[^>]*/>", "", page))
+    assert parser.open == []
+    return page, " ".join(parser.text)
+
+
+def test_the_page_holds_all_there_is_and_needs_nothing_else(tmp_path: Path) -> None:
+    page, text = read(report([survey(tmp_path / "run")], tmp_path / "report.html", False, silent))
+    assert "http" not in page
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
+    for expected in ("DN<200>", "no planned class", "50.0", "bag <torn>", "board ± 0.040 %", "p02", "40 considered"):
+        assert expected in text, expected
+    pictures = re.findall(r"data:image/png;base64,([^\"]+)", page)
+    assert len(pictures) == 2
+    for encoded in pictures:
+        image = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_COLOR)
+        blue, green, red = np.asarray(image).astype(int).transpose(2, 0, 1)
+        assert ((red > 120) & (green < 60) & (blue < 60)).mean() > 0.003, "the red pipe is in the picture"
+    assert page.count("<svg") == 2
+
+
+def test_several_surveys_become_a_series_in_the_order_of_their_dates(tmp_path: Path) -> None:
+    later, earlier = survey(tmp_path / "b", 7, 3.0), survey(tmp_path / "a", 0, 1.0)
+    page, text = read(report([later, earlier], tmp_path / "out", False, silent))
+    assert (tmp_path / "out" / "report.html").is_file()
+    assert "Progress over time" in text
+    assert text.index("a (2023-11-14") < text.index("b (2023-11-21")
+    assert "Pipe progress: b" in text
+    assert page.count("<svg") == 3
+
+
+def test_a_run_with_pipes_json_alone(tmp_path: Path) -> None:
+    folder = survey(tmp_path / "run")
+    for name in ("cloud.ply", "trajectory.tum", "config.yaml", "run.json"):
+        (folder / name).unlink()
+    _, text = read(report([folder], tmp_path / "report.html", False, silent))
+    assert "p01" in text
+
+
+def test_a_run_without_pipes(tmp_path: Path) -> None:
+    folder = survey(tmp_path / "run")
+    results.write_pipes(folder / "pipes.json", [], [], results.Scale("cloud", 0.0))
+    _, text = read(report([folder], tmp_path / "report.html", False, silent))
+    assert "as the cloud has it" in text
+
+
+def test_what_cannot_be_reported_is_an_error(tmp_path: Path) -> None:
+    folder = survey(tmp_path / "run")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "pipes.json").write_text('{"pipes": [{}], "classes": []}')
+    for folders, out, expected in (
+        ([tmp_path / "absent"], "r.html", "no such folder"),
+        ([tmp_path / "empty"], "r.html", "holds no pipes.json"),
+        ([tmp_path / "bad"], "r.html", "no pipes.json of pipeprog"),
+        ([folder, folder], "r.html", "given twice"),
+        ([folder], "r.pdf", "name it .html"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            report(folders, tmp_path / out, False, silent)
+    (tmp_path / "r.html").write_text("mine")
+    with pytest.raises(InputError, match="--force"):
+        report([folder], tmp_path / "r.html", False, silent)
+
+
+def test_the_nearer_surface_is_seen() -> None:
+    front = picture.ColoredPipe(cylinder(0.0), (1.0, 0.0, 0.0), "")
+    back = picture.ColoredPipe(Cylinder(np.array([0, 1.0, 0]), np.array([0, 1.0, 2]), 0.1), (0.0, 0.0, 1.0), "")
+    seen = picture.draw(np.empty((0, 3)), None, [back, front], np.array([0.0, -1.0, 0.0]), 300)
+    middle = seen[seen.shape[0] // 2, 150].astype(int)
+    assert middle[0] > 150 > middle[2]
+
+
+def test_the_two_sides_are_those_from_which_the_pipes_are_seen() -> None:
+    wall = np.random.default_rng(0).uniform([-2, 0.2, -1], [2, 0.21, 3], (20_000, 3))
+    pipes = [picture.ColoredPipe(cylinder(x), (1, 0, 0), "") for x in (-0.5, 0.5)]
+    first, second = picture.two_sides(wall, pipes)
+    assert first[1] < 0
+    assert second[1] < 0
+    assert np.degrees(np.arccos(first[:2] @ second[:2])) >= 49

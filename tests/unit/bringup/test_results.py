@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeprog_bringup import results
+from pipeprog_bringup.frame_log import FrameLog
+from pipeprog_bringup.output import OutputFolder
+from pipeprog_bringup.overrides import as_parameters, effective
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.classify import ClassProgress
+from pipeprog_detect.pipe import Cylinder, Pipe
+
+PIPE = Pipe(
+    "p03",
+    Cylinder(np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.42]), 0.0575),
+    0.0003,
+    "DN100",
+    0.99,
+    2.6,
+    0.0011,
+    20411,
+)
+CLASSES = [ClassProgress("DN100", 0.0575, 24.0, 11.3, 100 * 11.3 / 24)]
+
+
+def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
+    results.write_pipes(tmp_path / "pipes.json", [PIPE], CLASSES, results.Scale("board", 0.0004))
+    assert json.loads((tmp_path / "pipes.json").read_text()) == {
+        "frame_id": "map",
+        "scale": {"source": "board", "sigma": 0.0004},
+        "pipes": [
+            {
+                "id": "p03",
+                "start": [1.0, 2.0, 3.0],
+                "end": [1.0, 2.0, 4.42],
+                "radius": 0.0575,
+                "radius_sigma": 0.0003,
+                "length": 1.42,
+                "class": "DN100",
+                "class_probability": 0.99,
+                "visible_arc_deg": 149.0,
+                "rmse": 0.0011,
+                "points": 20411,
+            }
+        ],
+        "classes": [
+            {"class": "DN100", "outer_radius": 0.0575, "planned_m": 24.0, "installed_m": 11.3, "percent": 47.08}
+        ],
+    }
+
+
+def test_what_is_not_known_is_null(tmp_path: Path) -> None:
+    pipe = Pipe("p01", PIPE.cylinder, float("nan"), None, 0.0, 2.6, 0.001, 3)
+    results.write_pipes(tmp_path / "pipes.json", [pipe], [], results.Scale("board", None))
+    content = json.loads((tmp_path / "pipes.json").read_text())
+    assert content["pipes"][0]["class"] is content["pipes"][0]["radius_sigma"] is content["scale"]["sigma"] is None
+    assert content["classes"] == []
+
+
+def test_progress_csv(tmp_path: Path) -> None:
+    results.write_progress(tmp_path / "progress.csv", [PIPE, PIPE], CLASSES)
+    with (tmp_path / "progress.csv").open() as stream:
+        row = next(csv.DictReader(stream))
+    assert row == {
+        "class": "DN100",
+        "outer_radius_mm": "57.50",
+        "planned_m": "24.000",
+        "installed_m": "11.300",
+        "percent": "47.1",
+        "pipes": "2",
+    }
+
+
+@given(st.integers(0, 2**62))
+def test_stamps_survive_the_trajectory_to_the_nanosecond(tmp_path_factory: pytest.TempPathFactory, stamp: int) -> None:
+    path = tmp_path_factory.mktemp("tum") / "trajectory.tum"
+    results.write_trajectory(path, [stamp], np.array([[1.0, -2.0, 3.0]]), np.array([[0.5, 0.5, 0.5, 0.5]]))
+    stamps, poses = results.read_trajectory(path)
+    assert stamps.tolist() == [stamp]
+    np.testing.assert_allclose(poses[0], [[0, 0, 1, 1], [1, 0, 0, -2], [0, 1, 0, 3], [0, 0, 0, 1]], atol=1e-9)
+
+
+def test_run_json_lists_its_files(tmp_path: Path) -> None:
+    with OutputFolder(tmp_path / "out") as folder:
+        folder.file("pipes.json").write_text("{}")
+        results.write_run(folder, {"command": "detect"})
+    content = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert content["files"] == ["pipes.json", "run.json"]
+    assert content["versions"]["numpy"] == np.__version__
+
+
+def row(stamp: int, chosen: bool = False, reason: str = "why") -> results.FrameRow:
+    return results.FrameRow(stamp, chosen, reason)
+
+
+def test_the_frame_log_counts_what_is_on_its_way() -> None:
+    log = FrameLog()
+    for stamp in (1, 2, 3):
+        log.play(stamp)
+    log.skip(4, "damaged message")
+    log.decide(row(2, True))
+    assert (log.in_flight, log.considered, log.chosen) == (2, 2, 1)
+    log.decide(row(1))
+    log.decide(row(3))
+    assert [(r.stamp, r.chosen) for r in log.rows()] == [(1, False), (2, True), (3, False), (4, False)]
+
+
+def test_a_second_decision_revokes_the_first() -> None:
+    log = FrameLog()
+    log.play(1)
+    log.decide(row(1))
+    log.decide(row(1, True, "bridges"))
+    log.overlap(1, 0.8, True)
+    log.overlap(1, 0.9, True)
+    assert log.rows() == [results.FrameRow(1, True, "bridges", overlap_n=0.9, registered=True)]
+
+
+def test_frames_of_one_stamp_each_get_a_decision() -> None:
+    log = FrameLog()
+    log.play(1)
+    log.play(1)
+    log.decide(row(1, True))
+    assert log.in_flight == 1
+    log.decide(row(1, False, "repeated stamp"))
+    assert [(r.chosen, r.reason) for r in log.rows()] == [(True, "why"), (False, "repeated stamp")]
+    assert log.common_reasons() == "1 x repeated stamp"
+
+
+def test_settings_are_checked_before_anything_starts() -> None:
+    configs = effective(["sfm.mapper.max_features=1000", "detect.front_end = planes"])
+    assert as_parameters(configs)["sfm"]["mapper.max_features"] == 1000
+    assert configs["detect"].front_end == "planes"
+    for text, expected in (
+        ("sfm.maper.max_features=3", "sfm.mapper.max_features"),
+        ("sfm.mapper.max_features=many", "whole number"),
+        ("sfm.mapper.max_features=3", "out of range"),
+        ("detect.front_end=guess", "none of its choices"),
+        ("sfm.mapper.max_features", "node.param=value"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            effective([text])
+    with pytest.raises(InputError, match="unknown"):
+        effective(["sfm.mapper.max_features=1000"], ("detect",))
