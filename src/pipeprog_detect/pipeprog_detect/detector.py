@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeprog_camera.errors import InputError
 from pipeprog_detect import background, classify, hypotheses, normals, octree
@@ -13,16 +12,17 @@ from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
-from pipeprog_detect.verify import Candidate, measure, thin_start
+from pipeprog_detect.runs import elbows, join, near, spanning
+from pipeprog_detect.verify import Candidate, measure, own_points, settle, thin_start
 
-# Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1.05 to 2.9 times as large; coarse to fine,
-# each on what the ones before have not explained.
-_SCALES = (0.16, 0.113, 0.08, 0.056, 0.04, 0.028, 0.02)
-_SITES_PER_SCALE = 1.4
+# Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1 to 2 times as large. Fine to coarse, each on
+# what the ones before have not explained: a coarse patch may span two pipes of a rack, a fine one may not. The finest
+# comes last, when little is left for its many sites.
+_SCALES = (0.028, 0.04, 0.056, 0.08, 0.113, 0.16, 0.02)
 _POINTS_PER_SCALE = 7.0
 # Pipes up to this radius [m] are sought as lines of points, in neighbourhoods several times as wide.
 _THICKEST_LINE = 0.02
-_LINE_SCALES = (0.04,)
+_LINE_SCALE = 0.04
 
 Report = Callable[[float, str], None]
 
@@ -71,53 +71,74 @@ def find_candidates(
     config: DetectConfig,
     report: Report,
 ) -> list[Candidate]:
-    """Accepted cylinders of the tree's points, coarse scales first, none sharing points with another."""
+    """Accepted cylinders of the tree's points, none sharing points with another."""
     free = np.ones(len(tree.points), bool)
     accepted: list[Candidate] = []
-    scales = [scale for scale in _SCALES if scale < radius_range[1] and 3.0 * scale > radius_range[0]]
+
+    def consider(initial: Cylinder | None) -> None:
+        candidate = measure(tree, free, initial, sigma) if initial is not None else None
+        if candidate is not None and is_pipe(candidate, sigma, config):
+            accepted.append(candidate)
+            cylinder = candidate.cylinder
+            free[tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)] = False
+
+    scales = [scale for scale in _SCALES if scale < radius_range[1] and 2.0 * scale > radius_range[0]]
     for number, scale in enumerate(scales):
-        report(0.2 + 0.7 * number / len(scales), f"looking for pipes at {1e3 * scale:.0f} mm")
+        report(0.2 + 0.5 * number / len(scales), f"looking for pipes in patches of {1e3 * scale:.0f} mm")
         rest = tree.subset(free)
         fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
-        sites = rest.thinned(rest.level_of(scale / _SITES_PER_SCALE))
-        shape = normals.surfaces(fine, sites, scale, sigma)
+        shape = normals.surfaces(fine, rest.thinned(rest.level_of(scale)), scale, sigma)
         for initial, _ in hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range)):
-            candidate = measure(tree, free, initial, sigma)
-            if candidate is not None and is_pipe(candidate, sigma, config):
-                accepted.append(candidate)
-                free[claimed(tree, candidate, sigma)] = False
-    report(0.9, "looking for thin pipes")
+            consider(initial)
+    report(0.7, "looking for thin pipes")
     thin = [planned for planned in planned_radii if planned < _THICKEST_LINE] or [0.5 * _THICKEST_LINE]
     rest = tree.subset(free)
-    for scale in _LINE_SCALES:
-        fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
-        sites = rest.thinned(rest.level_of(0.5 * scale))
-        shape = normals.surfaces(fine, sites, scale, sigma)
-        for line, _ in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
-            initial = thin_start(tree, free, line, 1.3 * sigma, thin)
-            candidate = measure(tree, free, initial, sigma) if initial is not None else None
+    fine = rest.thinned(rest.level_of(_LINE_SCALE / _POINTS_PER_SCALE))
+    shape = normals.surfaces(fine, rest.thinned(rest.level_of(0.5 * _LINE_SCALE)), _LINE_SCALE, sigma)
+    for line, _ in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
+        consider(thin_start(tree, free, line, 1.2 * sigma, thin))
+    report(0.8, "measuring")
+    return _settled(tree, accepted, sigma, config)
+
+
+def _settled(tree: Octree, accepted: list[Candidate], sigma: float, config: DetectConfig) -> list[Candidate]:
+    """Pieces of one pipe joined, then each measured on what lies nearest to it, elbows and the unfounded left out.
+
+    The pipe found first had its neighbour's points as well: once both are known they are told apart.
+    """
+    for _ in range(2):
+        joined = join([candidate.cylinder for candidate in accepted])
+        settled = []
+        for pieces in joined:
+            best = max(pieces, key=lambda piece: accepted[piece].points)
+            cylinder = spanning([accepted[piece].cylinder for piece in pieces], best=pieces.index(best))
+            band = accepted[best].band
+            margin = cylinder.radius * cylinder.axis
+            reach = 1.5 * cylinder.radius + 6.0 * band
+            rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
+            others = [accepted[k].cylinder for k in range(len(accepted)) if k not in pieces]
+            points = own_points(
+                tree.points[rows], cylinder, [other for other in others if near(other, cylinder, reach)]
+            )
+            candidate = settle(points, cylinder, band, np.inf)
             if candidate is not None and is_pipe(candidate, sigma, config):
-                accepted.append(candidate)
-                free[claimed(tree, candidate, sigma)] = False
-    return accepted
-
-
-def claimed(tree: Octree, candidate: Candidate, sigma: float) -> NDArray[np.int64]:
-    """Rows of the tree that an accepted pipe explains: its surface and what lies in its barrel."""
-    margin = 4.0 * max(sigma, candidate.evidence.noise)
-    cylinder = candidate.cylinder
-    return tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + margin)
+                settled.append(candidate)
+        accepted = settled
+    bends = elbows([candidate.cylinder for candidate in accepted])
+    return [candidate for number, candidate in enumerate(accepted) if number not in bends]
 
 
 def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig) -> bool:
     """Whether the evidence makes a pipe of a cylinder."""
     evidence, cylinder = candidate.evidence, candidate.cylinder
+    # The smaller the arc, the more surfaces that are no pipe fit it: its length has to make up for that.
+    slender = 3.0 if evidence.arc > np.radians(90.0) else 6.0
     return (
-        cylinder.length >= max(3.0 * cylinder.radius, config.length_min)
+        cylinder.length >= max(slender * cylinder.radius, config.length_min)
         and evidence.arc >= np.radians(config.arc_min_deg)
         and evidence.coverage > 0.4
         and evidence.inside < 0.15
-        and evidence.noise < 2.0 * sigma + 1e-3
+        and evidence.noise < 1.6 * sigma + 8e-4
         and evidence.roundness < 0.3 * sigma + 0.02 * cylinder.radius + 3e-4
         and evidence.flatness > 1.3
     )
@@ -125,7 +146,7 @@ def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig) -> bool:
 
 def _pipe(candidate: Candidate, bill: Bill, shift: FloatArray) -> Pipe:
     cylinder = candidate.cylinder
-    sigma = candidate.fit.radius_sigma
+    sigma = candidate.radius_sigma
     name, probability = classify.classify(cylinder.radius, sigma, bill)
     return Pipe(
         "",
@@ -135,7 +156,7 @@ def _pipe(candidate: Candidate, bill: Bill, shift: FloatArray) -> Pipe:
         probability,
         candidate.evidence.arc,
         candidate.evidence.noise,
-        len(candidate.rows),
+        candidate.points,
     )
 
 

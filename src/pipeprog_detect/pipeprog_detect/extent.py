@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from pipeprog_detect.fit import basis
 from pipeprog_detect.pipe import Cylinder, FloatArray
@@ -13,7 +15,8 @@ _SECTORS = 36
 # A bin of the barrel is seen where its points cover this angle, a bin is empty under this share of its neighbours.
 _LEAST_ARC = np.radians(30.0)
 _LEAST_SHARE = 0.25
-_WAVINESS = 1e-3
+# Pipes sag and clouds wave by this much [m]; an elbow leaves the line by more within a fraction of its radius.
+_WAVINESS = 3e-3
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ def bin_length(radius: float, points_per_metre: float) -> float:
     return float(np.clip(12.0 / max(points_per_metre, 1.0), 0.005, max(radius, 0.03)))
 
 
-def surface_runs(points: FloatArray, cylinder: Cylinder, gap: float) -> list[Run]:
-    """Stretches of the axis along which points (N, 3), all near the surface, cover the pipe; gaps under `gap` closed.
+def surface_runs(points: FloatArray, cylinder: Cylinder) -> list[Run]:
+    """Stretches of the axis along which points (N, 3), all near the surface, cover the pipe.
 
     Positions are metres from cylinder.start along its axis. Ends lie where the occupancy falls to half of the run's
     own level, between bins by linear interpolation.
@@ -64,11 +67,7 @@ def surface_runs(points: FloatArray, cylinder: Cylinder, gap: float) -> list[Run
     runs: list[Run] = []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        start, end = _ends(count, first, last, low, size)
-        if runs and start - runs[-1].high < gap:
-            runs[-1] = Run(runs[-1].low, end)
-        else:
-            runs.append(Run(start, end))
+        runs.append(Run(*_ends(count, first, last, low, size)))
     return runs
 
 
@@ -86,7 +85,7 @@ def straight_stretch(points: FloatArray, cylinder: Cylinder, sigma: float) -> Ru
     rho = np.hypot(x, y) + 1e-12
     distance = rho - cylinder.radius
     length = float(along.max() - along.min())
-    slices = int(np.clip(length / (0.4 * cylinder.radius + 0.01), 6, 60))
+    slices = int(np.clip(min(length / (0.3 * cylinder.radius + 0.005), len(points) / 16), 6, 120))
     low = float(along.min())
     size = length / slices
     place = np.clip(((along - low) / size).astype(int), 0, slices - 1)
@@ -95,29 +94,80 @@ def straight_stretch(points: FloatArray, cylinder: Cylinder, sigma: float) -> Ru
     known = np.flatnonzero(np.isfinite(error))
     if len(known) < 4:
         return Run(low, low + length)
-    # Waviness of a real pipe, and what an elbow may bend off unseen.
     allowed = 2.5 * error + _WAVINESS + 0.02 * cylinder.radius
     centre = low + (np.arange(slices) + 0.5) * size
-    best, members = -1.0, known
-    for first in known:
-        for second in known[known > first + slices // 6]:
-            slope = (shift[second] - shift[first]) / (centre[second] - centre[first])
-            miss = np.linalg.norm(
-                shift[known] - shift[first] - (centre[known] - centre[first])[:, None] * slope, axis=1
-            )
-            agree = miss < allowed[known]
-            worth = float(agree.sum()) - float((miss[agree] / allowed[known][agree]).sum()) * 0.5
-            if worth > best:
-                best, members = worth, known[agree]
-    if best < 0:
+    line = _best_line(centre[known], shift[known], allowed[known], max(slices // 6, 1) * size)
+    if not line.any():
         return None
+    members = known[line]
     # The stretch may bridge slices without points or with an obstacle, not a run of slices that disagree.
     holes = np.flatnonzero(
         [np.isin(np.arange(a + 1, b), known).sum() > 2 for a, b in zip(members, members[1:], strict=False)]
     )
     parts = np.split(members, holes + 1)
     longest = max(parts, key=len)
-    return Run(low + longest[0] * size, low + (longest[-1] + 1) * size)
+    slope, origin = _fit_line(centre[longest], shift[longest], 1.0 / error[longest])
+    bent = np.linalg.norm(shift - origin - centre[:, None] * slope, axis=1) / error
+    deviation = bent * error
+    return Run(
+        _onset(low + longest[0] * size, -1, int(longest[0]), centre, deviation, bent, size),
+        _onset(low + (longest[-1] + 1) * size, 1, int(longest[-1]), centre, deviation, bent, size),
+    )
+
+
+def _fit_line(place: FloatArray, shift: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Slope (2,) and value at 0 (2,) of shift (S, 2) over place (S,)."""
+    rows = np.stack([place, np.ones_like(place)], axis=1) * weight[:, None]
+    solved = np.linalg.lstsq(rows, shift * weight[:, None], rcond=None)[0]
+    return solved[0], solved[1]
+
+
+def _onset(
+    end: float, step: int, last: int, centre: FloatArray, deviation: FloatArray, bent: FloatArray, size: float
+) -> float:
+    """Where an elbow begins: beyond it the section leaves the line by s^2 / (2 R), so its root grows evenly.
+
+    `last` is the outermost slice that agrees with the line, `end` [m] its outer edge, `step` the way out. Slices
+    within it may be bent already, by less than the tolerance. Without a bend beyond, the end stands.
+    """
+    slices = last + step * np.arange(-2, 4)
+    slices = slices[(slices >= 0) & (slices < len(centre))]
+    slices = slices[np.nan_to_num(bent[slices]) > 3.0]
+    if len(slices) < 3:
+        return end
+    root = np.sqrt(deviation[slices])
+    slope, start = np.polyfit(centre[slices], root, 1)
+    if slope * step <= 0:
+        return end
+    onset = -start / slope
+    return float(min(max(onset, end - 4 * size), end) if step > 0 else max(min(onset, end + 4 * size), end))
+
+
+@njit(cache=True)
+def _best_line(place: FloatArray, shift: FloatArray, allowed: FloatArray, apart: float) -> NDArray[np.bool_]:
+    """Which slices agree with the line through two of them, at least `apart`, that most agree with, and most closely."""
+    count = len(place)
+    best = 0.0
+    members = np.zeros(count, np.bool_)
+    agree = np.zeros(count, np.bool_)
+    for first in range(count):
+        for second in range(first + 1, count):
+            run = place[second] - place[first]
+            if run < apart:
+                continue
+            su, sv = (shift[second, 0] - shift[first, 0]) / run, (shift[second, 1] - shift[first, 1]) / run
+            worth = 0.0
+            for k in range(count):
+                du = shift[k, 0] - shift[first, 0] - (place[k] - place[first]) * su
+                dv = shift[k, 1] - shift[first, 1] - (place[k] - place[first]) * sv
+                miss = np.sqrt(du * du + dv * dv) / allowed[k]
+                agree[k] = miss < 1.0
+                if agree[k]:
+                    worth += 1.0 - 0.5 * miss
+            if worth > best:
+                best = worth
+                members[:] = agree
+    return members
 
 
 def _slice_shifts(

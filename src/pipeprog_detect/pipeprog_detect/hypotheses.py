@@ -34,15 +34,14 @@ class Votes:
 def votes_of(shape: Surfaces, sigma: float, radius_range: tuple[float, float]) -> Votes:
     """Votes of the sites whose patch is bent one way only, clearly above the noise, by a radius in the range [m].
 
-    The patch must span enough of the circle to show its bend (h / r > 0.35) and not more than it can be seen on
-    (h / r < 1).
+    The patch must span enough of the circle to show its bend (h / r > 0.5) and not more than can be seen (h / r < 1).
     """
     bend = np.abs(shape.curvature)
     low, high = 1.0 / radius_range[1], 1.0 / radius_range[0]
-    good = (shape.count > 0) & (bend > max(low, 0.35 / shape.scale)) & (bend < min(high, 1.0 / shape.scale))
+    good = (shape.count > 0) & (bend > max(low, 0.5 / shape.scale)) & (bend < min(high, 1.0 / shape.scale))
     good &= bend > 4.0 * shape.sigma
     good &= np.abs(shape.second) < np.maximum(0.35 * bend, 2.0 * shape.sigma)
-    good &= (shape.rms < 2.0 * sigma + 5e-4) & (shape.inliers > 0.6)
+    good &= (shape.rms < 2.0 * sigma + 5e-4) & (shape.inliers > 0.75)
     centres = shape.feet[good] - shape.normals[good] / shape.curvature[good][:, None]
     return Votes(centres, shape.directions[good], 1.0 / bend[good], shape.scale)
 

@@ -64,7 +64,7 @@ class Octree:
         return self.origin + (_decode(cells.keys) + 0.5) * cells.size
 
     def subset(self, mask: NDArray[np.bool_]) -> Octree:
-        """The tree of the points where mask (N,) holds."""
+        """The tree of the points where mask (N,) is true."""
         return Octree(self.points[mask], self.keys[mask], self.order[mask], self.origin, self.quantum)
 
     def thinned(self, level: int) -> Octree:

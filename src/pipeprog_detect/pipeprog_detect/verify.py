@@ -1,37 +1,36 @@
-"""From a hypothesis to a measured cylinder, or to the reason why it is none."""
+"""From a hypothesis to a measured cylinder with the evidence for and against it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeprog_detect.extent import Run, straight_stretch, surface_runs
 from pipeprog_detect.fit import CylinderFit, basis, covered_arc, fit_cylinder
 from pipeprog_detect.octree import IntArray, Octree
 from pipeprog_detect.pipe import Cylinder, FloatArray
 
-_FIT_POINTS = 6000
-_FINAL_POINTS = 20000
+_FIT_POINTS = 2500
+_FINAL_POINTS = 12000
+# Noise above this share of the radius blurs half a circle into a blob whose circle fit is far too small.
+_BLURRED = 0.16
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What speaks for and against a cylinder.
 
-    arc [rad] of the surface seen; coverage: share of the length that shows surface; inside: points within the barrel,
-    well under its surface, per point on it; beyond: points close outside the seen surface, per point on it;
-    noise [m]: spread of the points across the surface; roundness [m]: root mean square over the sectors of the
-    section of their mean distance from the circle, 0 for a true one; flatness: mean square from the best plane over the mean square
-    from the cylinder.
+    arc [rad]: widest stretch of the circumference seen; coverage: share of the length that shows surface; inside:
+    points within the barrel, well under its surface, per point on it; noise [m]: spread of the points across the
+    surface; roundness [m]: root mean square over the sectors of the section of their mean distance from the circle,
+    0 for a true one; flatness: mean square from the best plane over the mean square from the cylinder.
     """
 
     arc: float
     coverage: float
     inside: float
-    beyond: float
     noise: float
     roundness: float
     flatness: float
@@ -39,72 +38,95 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A measured cylinder, its fit, the rows of the tree on its surface, the stretches seen, and the evidence."""
+    """A measured cylinder, standard deviation of its radius [m], points on its surface, stretches seen, evidence."""
 
     cylinder: Cylinder
-    fit: CylinderFit
-    rows: IntArray
+    radius_sigma: float
+    points: int
     runs: list[Run]
     evidence: Evidence
 
+    @property
+    def band(self) -> float:
+        """Width [m] that counts as one standard deviation when points are taken for its surface."""
+        return 1.2 * self.evidence.noise + 2e-4
 
-def measure(tree: Octree, free: NDArray[np.bool_], initial: Cylinder, sigma: float) -> Candidate | None:
-    """Fit `initial` to the free points of the tree, follow it along its axis to its ends, and collect the evidence.
 
-    sigma [m] is the cloud's typical noise; a pipe's own may be up to twice that (head-on surfaces, waviness).
+def measure(tree: Octree, free: IntArray | np.ndarray, initial: Cylinder, sigma: float) -> Candidate | None:
+    """Fit `initial` to the points of the tree that are free (N,) bool, and follow it along its axis to its ends.
+
+    sigma [m] is the cloud's typical noise; a pipe's own may be up to 1.6 times that (head-on surfaces, waviness).
     """
-    wide = 1.3 * sigma + 2e-4
-    start, end = initial.start, initial.end
+    wide = 1.2 * sigma + 5e-4
     cylinder = initial
-    fit: CylinderFit | None = None
-    runs: list[Run] = []
     for turn in range(12):
         axis = cylinder.axis
         step = max(0.5 * cylinder.length, 0.25, 4.0 * cylinder.radius) if turn else 0.0
-        start, end = cylinder.start - step * axis, cylinder.end + step * axis
         # Hypotheses are right to a tenth of the radius; a wider reach would take in the neighbour of a rack.
         reach = 1.0 + 0.1 * cylinder.radius / wide if turn == 0 else 1.2
-        rows = tree.near_segment(start, end, cylinder.radius + 4.0 * wide * reach)
-        rows = rows[free[rows]]
-        if len(rows) < 30:
+        rows = tree.near_segment(
+            cylinder.start - step * axis, cylinder.end + step * axis, cylinder.radius + 4.0 * wide * reach
+        )
+        points = tree.points[rows[free[rows]]]
+        if len(points) < 30:
             return None
-        points = tree.points[rows]
+        grown = np.inf
         if turn:
-            distance = _signed_distance(points, cylinder)
-            skin = points[np.abs(distance) < 3.0 * wide]
-            straight = straight_stretch(skin, cylinder, wide) if len(skin) > 30 else None
-            if straight is None:
-                return None
-            skin = _within(skin, cylinder, straight)
-            runs = _connected(surface_runs(skin, cylinder, 0.0), cylinder)
+            runs = _seen_runs(points, cylinder, wide, _longest_gap(cylinder.radius))
             if not runs:
                 return None
             low, high = runs[0].low, runs[-1].high
             grown = max(-low, high - cylinder.length)
             cylinder = _cut(cylinder, low, high)
             points = _within(points, cylinder, Run(0.0, cylinder.length))
-        else:
-            grown = np.inf
-        fit = fit_cylinder(_spread_out(points, _FIT_POINTS), None, cylinder, wide, reach=reach)
+        fit = fit_cylinder(_spread_out(points, _FIT_POINTS), None, cylinder, wide, reach=reach, along_ray=False)
         if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
             return None
-        wide = float(np.clip(1.3 * fit.rmse, 0.7 * sigma, 2.0 * sigma + 1e-3))
+        wide = float(np.clip(1.2 * fit.rmse, 0.7 * sigma + 3e-4, 1.6 * sigma + 7e-4))
         cylinder = fit.cylinder if turn == 0 else _between(fit.cylinder, cylinder)
         if grown < 0.02 and turn >= 2:
             break
-    return _finish(tree, free, cylinder, wide)
+    margin = cylinder.radius * cylinder.axis
+    rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, 1.5 * cylinder.radius + 6.0 * wide)
+    return settle(tree.points[rows[free[rows]]], cylinder, wide, _longest_gap(cylinder.radius))
+
+
+def settle(points: FloatArray, cylinder: Cylinder, wide: float, gap: float) -> Candidate | None:
+    """Measure a cylinder that is nearly right on the points (N, 3) around it, all of which are its own or nobody's.
+
+    Points within three times `wide` [m] are its surface; stretches of it apart by less than `gap` [m] are one pipe.
+    """
+    near = points[np.abs(_signed_distance(points, cylinder)) < 5.0 * wide]
+    # A cap closes the end: its points lie within the barrel all around, and would draw the radius in.
+    body = _within(near, cylinder, _without_caps(cylinder, wide))
+    fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), None, cylinder, wide, reach=1.0)
+    if fit is None:
+        return None
+    radius_sigma = float(np.hypot(fit.radius_sigma, fit.rmse**2 / fit.cylinder.radius))
+    if fit.rmse > _BLURRED * cylinder.radius:
+        fit, radius_sigma = _by_width(body, cylinder, fit, wide)
+    cylinder = _between(fit.cylinder, cylinder)
+    runs = _seen_runs(near, cylinder, wide, gap)
+    if not runs:
+        return None
+    cut = _cut(cylinder, runs[0].low, runs[-1].high)
+    runs = [Run(run.low - runs[0].low, run.high - runs[0].low) for run in runs]
+    surface = _within(near, cut, Run(0.0, cut.length))
+    surface = surface[np.abs(_signed_distance(surface, cut)) < 3.0 * wide]
+    if len(_within(surface, cut, _without_caps(cut, wide))) < 30:
+        return None
+    return Candidate(cut, radius_sigma, len(surface), runs, _evidence(points, cut, runs, surface, wide))
 
 
 def thin_start(
-    tree: Octree, free: NDArray[np.bool_], line: Cylinder, sigma: float, radii: Sequence[float]
+    tree: Octree, free: IntArray | np.ndarray, line: Cylinder, sigma: float, radii: Sequence[float]
 ) -> Cylinder | None:
     """The cylinder, of those of the given radii about a line through the points of a thin pipe, that explains most.
 
     The line runs through the mean of the points, that is before the axis by about half a radius on a side that is
     not known: each of eight sides is tried.
     """
-    axis = line.axis
-    u, v = basis(axis)
+    u, v = basis(line.axis)
     rows = tree.near_segment(line.start, line.end, 2.5 * max(radii) + 4.0 * sigma)
     points = _spread_out(tree.points[rows[free[rows]]], 1500)
     best, most = None, 0.0
@@ -112,67 +134,74 @@ def thin_start(
         for angle in np.arange(8) * (np.pi / 4):
             shift = 0.6 * radius * (np.cos(angle) * u + np.sin(angle) * v)
             initial = Cylinder(line.start + shift, line.end + shift, radius)
-            fit = fit_cylinder(points, None, initial, sigma, reach=1.0)
-            if fit is None or not 0.6 * min(radii) < fit.cylinder.radius < 1.5 * max(radii):
+            fit = fit_cylinder(points, None, initial, sigma, reach=1.0, along_ray=False)
+            if fit is None or not 0.5 * min(radii) < fit.cylinder.radius < 1.5 * max(radii):
                 continue
             share = np.clip(1.0 - (_signed_distance(points, fit.cylinder) / (4.0 * sigma)) ** 2, 0.0, None)
-            # The worth of a residual within the noise, per point; a wider circle fits a blob no better by that.
             worth = float((share**2).sum())
             if worth > most:
                 best, most = fit.cylinder, worth
     return best
 
 
-def _finish(tree: Octree, free: NDArray[np.bool_], cylinder: Cylinder, wide: float) -> Candidate | None:
-    margin = cylinder.radius * cylinder.axis
-    rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, cylinder.radius + 4.0 * wide)
-    rows = rows[free[rows]]
-    points = tree.points[rows]
-    along = (points - cylinder.start) @ cylinder.axis
-    body = points[(along >= 0) & (along <= cylinder.length)]
-    fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), None, cylinder, wide, reach=1.0)
-    if fit is None:
-        return None
-    cylinder = _between(fit.cylinder, cylinder)
-    distance = _signed_distance(points, cylinder)
-    on = np.abs(distance) < 3.0 * wide
-    if on.sum() < 30:
-        return None
-    straight = straight_stretch(points[on], cylinder, wide)
-    if straight is None:
-        return None
-    runs = _connected(surface_runs(_within(points[on], cylinder, straight), cylinder, 0.0), cylinder)
-    if not runs:
-        return None
-    cut = _cut(cylinder, runs[0].low, runs[-1].high)
-    runs = [Run(run.low - runs[0].low, run.high - runs[0].low) for run in runs]
-    along = (points - cut.start) @ cut.axis
-    on &= (along >= 0) & (along <= cut.length)
-    if on.sum() < 30:
-        return None
-    return Candidate(cut, fit, rows[on], runs, _evidence(tree, free, cut, runs, points[on], wide))
+def own_points(points: FloatArray, cylinder: Cylinder, others: Sequence[Cylinder]) -> FloatArray:
+    """The points (N, 3) that lie no nearer to the surface of one of the others than to the cylinder's."""
+    mine = np.abs(_signed_distance(points, cylinder))
+    keep = np.ones(len(points), bool)
+    for other in others:
+        along = (points - other.start) @ other.axis
+        theirs = _signed_distance(points, other)
+        # What lies within another barrel is its too: nothing passes through a pipe.
+        keep &= ~((along > 0) & (along < other.length) & (theirs < mine))
+    return points[keep]
 
 
-def _evidence(
-    tree: Octree, free: NDArray[np.bool_], cylinder: Cylinder, runs: list[Run], surface: FloatArray, wide: float
-) -> Evidence:
-    radius = cylinder.radius
+def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: float) -> tuple[CylinderFit, float]:
+    """Fit at the radius that the width of a blurred pipe's points tells, and that radius's standard deviation [m].
+
+    A sensor's rays meet a pipe evenly over its width until they graze it: seen from one side, the points spread over
+    2 r s with s = sin(70 deg) at least, and so by r s / sqrt(3); the noise across the ray, a third of that along it
+    for a scanner, as much for a fused cloud, adds to that and is taken in between.
+    """
+    axis = fit.cylinder.axis
+    offset = points - fit.cylinder.start
+    lateral = offset - (offset @ axis)[:, None] * axis
+    near = lateral[np.linalg.norm(lateral, axis=1) < 2.0 * cylinder.radius + 2.0 * wide]
+    if len(near) < 50:
+        return fit, fit.cylinder.radius
+    for _ in range(3):
+        centred = near - np.median(near, axis=0)
+        values, vectors = np.linalg.eigh(centred.T @ centred / len(centred))
+        along = centred @ vectors[:, 2]
+        near = near[np.abs(along) < 2.5 * np.sqrt(values[2])]
+    seen = 0.96
+    noise = 0.65 * fit.rmse
+    square = max(float(values[2]) - noise**2, 0.25 * float(values[2]))
+    radius = float(np.sqrt(3.0 * square) / seen)
+    again = fit_cylinder(
+        _spread_out(points, _FINAL_POINTS), None, replace(cylinder, radius=radius), wide, reach=1.0, fixed_radius=radius
+    )
+    # The share of the noise across is known to a third of it, the seen width to a twentieth.
+    sigma = float(np.hypot(0.05 * radius, 1.5 * 0.5 * noise**2 / radius))
+    return (again or fit), sigma
+
+
+def _evidence(points: FloatArray, cylinder: Cylinder, runs: list[Run], surface: FloatArray, wide: float) -> Evidence:
+    body = _without_caps(cylinder, wide)
+    surface = _within(surface, cylinder, body)
     distance = _signed_distance(surface, cylinder)
-    arc = covered_arc(surface, cylinder)
-    coverage = sum(run.length for run in runs) / cylinder.length
-    shell = max(6.0 * wide, 0.5 * radius)
-    rows = tree.near_segment(cylinder.start, cylinder.end, radius + shell)
-    rows = rows[free[rows]]
-    near = _signed_distance(tree.points[rows], cylinder)
-    inside = float((near < -4.0 * wide).sum()) / len(surface)
-    beyond = float((near > 4.0 * wide).sum()) / len(surface)
+    inside = float((_signed_distance(_within(points, cylinder, body), cylinder) < -4.0 * wide).sum()) / len(surface)
     offset = surface - surface.mean(axis=0)
     lateral = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
     values = np.linalg.eigvalsh(lateral.T @ lateral / len(lateral))
     square = float(np.mean(distance**2))
-    roundness = _roundness(surface, cylinder, distance)
     return Evidence(
-        arc, coverage, inside, beyond, float(np.sqrt(square)), roundness, float(values[1]) / max(square, 1e-12)
+        arc=covered_arc(surface, cylinder),
+        coverage=sum(run.length for run in runs) / cylinder.length,
+        inside=inside,
+        noise=float(np.sqrt(square)),
+        roundness=_roundness(surface, cylinder, distance),
+        flatness=float(values[1]) / max(square, 1e-12),
     )
 
 
@@ -195,29 +224,37 @@ def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(square, 0.0)) - cylinder.radius)
 
 
-def _within(points: FloatArray, cylinder: Cylinder, run: Run) -> FloatArray:
-    along = (points - cylinder.start) @ cylinder.axis
-    return points[(along >= run.low) & (along <= run.high)]
+def _seen_runs(points: FloatArray, cylinder: Cylinder, wide: float, gap: float) -> list[Run]:
+    """Stretches of the axis that show surface and lie on one line, without an elbow at an end."""
+    skin = points[np.abs(_signed_distance(points, cylinder)) < 3.0 * wide]
+    if len(skin) < 30:
+        return []
+    straight = straight_stretch(skin, cylinder, wide)
+    if straight is None:
+        return []
+    return _connected(surface_runs(_within(skin, cylinder, straight), cylinder), gap, cylinder.radius)
 
 
-def _connected(runs: list[Run], cylinder: Cylinder) -> list[Run]:
-    """The runs that belong together: from the longest one outwards, over gaps a clamp or an occluder may explain."""
-    gap = max(10.0 * cylinder.radius, 0.3)
-    runs = [run for run in runs if run.length > max(0.5 * cylinder.radius, 0.015)]
+def _longest_gap(radius: float) -> float:
+    """Gap [m] in the surface that a clamp, a flange or an occluder explains."""
+    return max(10.0 * radius, 0.3)
+
+
+def _connected(runs: list[Run], gap: float, radius: float) -> list[Run]:
+    """The runs that belong together: from the longest one outwards, a short piece beyond a long gap left out."""
+    runs = [run for run in runs if run.length > max(0.5 * radius, 0.015)]
     if not runs:
         return []
-    core = int(np.argmax([run.length for run in runs]))
-    first = last = core
-    while first > 0 and _bridged(runs[first - 1], runs[first].low - runs[first - 1].high, gap, cylinder):
+    first = last = int(np.argmax([run.length for run in runs]))
+    while first > 0 and _bridged(runs[first - 1], runs[first].low - runs[first - 1].high, gap, radius):
         first -= 1
-    while last + 1 < len(runs) and _bridged(runs[last + 1], runs[last + 1].low - runs[last].high, gap, cylinder):
+    while last + 1 < len(runs) and _bridged(runs[last + 1], runs[last + 1].low - runs[last].high, gap, radius):
         last += 1
     return runs[first : last + 1]
 
 
-def _bridged(run: Run, gap: float, most: float, cylinder: Cylinder) -> bool:
-    """A short piece beyond a long gap is more likely something else."""
-    return gap < min(most, max(4.0 * run.length, cylinder.radius))
+def _bridged(run: Run, gap: float, most: float, radius: float) -> bool:
+    return gap < min(most, max(4.0 * run.length, radius))
 
 
 def _cut(cylinder: Cylinder, low: float, high: float) -> Cylinder:
@@ -227,8 +264,18 @@ def _cut(cylinder: Cylinder, low: float, high: float) -> Cylinder:
 def _between(line: Cylinder, ends: Cylinder) -> Cylinder:
     """The cylinder `line` with the ends of another one, projected."""
     axis = line.axis
-    low, high = (ends.start - line.start) @ axis, (ends.end - line.start) @ axis
+    low, high = float((ends.start - line.start) @ axis), float((ends.end - line.start) @ axis)
     return _cut(line, min(low, high), max(low, high))
+
+
+def _without_caps(cylinder: Cylinder, wide: float) -> Run:
+    cap = min(5.0 * wide + 5e-3, 0.2 * cylinder.length)
+    return Run(cap, cylinder.length - cap)
+
+
+def _within(points: FloatArray, cylinder: Cylinder, run: Run) -> FloatArray:
+    along = (points - cylinder.start) @ cylinder.axis
+    return points[(along >= run.low) & (along <= run.high)]
 
 
 def _spread_out(points: FloatArray, most: int) -> FloatArray:
