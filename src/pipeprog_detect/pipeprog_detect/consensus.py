@@ -75,8 +75,8 @@ def search(
     random: np.random.Generator,
     elites: int = 96,
     offspring: int = 32,
-) -> tuple[FloatArray, FloatArray]:
-    """Best steps (E, 5) within +-`reach` (5,) [m] and their scores, best first.
+) -> FloatArray:
+    """Best steps (E, 5) within +-`reach` (5,) [m], best first.
 
     A Sobol grid over the whole box is scored against widely smeared edges; the best are spread again and again with
     half the step and half the smear (annealing) down to a third of a pixel. `seeds` (S, 5) join the first grid.
@@ -85,18 +85,46 @@ def search(
     half_width = float(np.median(at.half_width))
     grid = qmc.Sobol(5, seed=random).random(8192) * 2.0 - 1.0
     population = np.concatenate([np.zeros((1, 5)), seeds, grid * reach])
+    outlines = np.stack([at.jacobian[at.side == side].mean(axis=0) for side in (0, 1)], axis=1)
     width = max(0.12 * half_width, 1.0)
     spread = 0.2 * reach
     first, step = float(offsets[0]), float(offsets[1] - offsets[0])
     while True:
         smear = smeared(response, offsets, at, width)
         score = _scores(population, at.jacobian, smear, first, step)
-        best = np.argsort(-score, kind="stable")[:elites]
-        population, score = population[best], score[best]
+        order = np.argsort(-score, kind="stable")
+        population = population[order[_niched(population[order] @ outlines, elites)]]
         if spread.max() * gain < 0.2:
-            return population, score
+            return population
         cloud = random.normal(size=(len(population), offspring, 5)) * spread
         children = np.clip(population[:, None] + cloud, -reach, reach).reshape(-1, 5)
         population = np.concatenate([population, children])
         spread = 0.6 * spread
         width = max(0.6 * width, 1.0)
+
+
+def _niched(displacement: FloatArray, count: int, cell: float = 2.0, crowd: int = 16) -> NDArray[np.int64]:
+    """Indices of the first `count` of displacements (M, 2) px with no more than `crowd` in one cell of `cell` px.
+
+    Keeps rival hypotheses alive, such as an outline and a shadow's edge beside it, until sub-pixel edges decide.
+    """
+    place = np.round(displacement / cell).astype(np.int64)
+    _, cells = np.unique(place, axis=0, return_inverse=True)
+    order = np.argsort(cells.ravel(), kind="stable")
+    ordered = cells.ravel()[order]
+    first = np.r_[0, np.flatnonzero(np.diff(ordered)) + 1]
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order)) - np.repeat(first, np.diff(np.r_[first, len(order)]))
+    return np.flatnonzero(rank < crowd)[:count]
+
+
+def distinct(population: FloatArray, at: Stations, apart: float, limit: int) -> FloatArray:
+    """The first steps (K <= limit, 5) of a population, best first, whose outlines differ by `apart` px rms or more."""
+    displaced = population @ at.jacobian.T
+    kept: list[int] = []
+    for index in range(len(population)):
+        if all(np.sqrt(np.mean((displaced[index] - displaced[other]) ** 2)) >= apart for other in kept):
+            kept.append(index)
+        if len(kept) == limit:
+            break
+    return population[kept]

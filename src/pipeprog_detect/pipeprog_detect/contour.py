@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.consensus import responses, search
+from pipeprog_detect.consensus import distinct, responses, search
 from pipeprog_detect.edges import (
-    SHARP,
     WINDOW_OF_HALF_WIDTH,
     LimbEdges,
     estimate_blur,
@@ -19,7 +18,7 @@ from pipeprog_detect.edges import (
     profiles,
     sideways,
 )
-from pipeprog_detect.outline import Stations, frame, moved, stations, viewing_direction, visible
+from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.rim import End, find_end
 from pipeprog_detect.support import hits, support_profile
@@ -30,6 +29,11 @@ CHUNK = 12
 ROBUST, FLOOR = 0.3, 0.1
 # A tenth of the blur remains as the limb model's own error, common to all views [px].
 MODEL_ERROR = 0.05
+# Where the vote cannot tell, so many candidates compete on sub-pixel edges.
+CANDIDATES = 3
+# Edges count within so many pixels of the vote's and of the refined outlines.
+COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
+MIN_STATIONS = 20
 # Cylinders that are not there stay under 0.1 (see `support`).
 MIN_SUPPORT = 0.25
 
@@ -74,19 +78,20 @@ def refine(
     if not views:
         return None
     basis = frame(cylinder, viewing_direction(cylinder, views))
-    step = _vote(cylinder, initial_radius_sigma, views, others, basis, planned_radii)
-    if step is None:
+    candidates = _vote(cylinder, initial_radius_sigma, views, others, basis, planned_radii)
+    if not len(candidates):
         return None
-    view_offset: FloatArray = np.zeros(len(views))
     prior = np.zeros(5)
     prior[:4] = 1.0 / (2.0 * initial_radius_sigma) ** 2
-    blur = SHARP
-    for reach in (2.5, 1.5, 1.2, 1.2):
+    scene = (views, others, basis)
+    view_offset: FloatArray = np.zeros(len(views))
+    blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, view_offset, CHUNK)
+    trials = [_improved(cylinder, candidate, scene, blur, prior) for candidate in candidates]
+    step, _ = max(trials, key=lambda trial: trial[1])
+    for _ in range(FINE_PASSES):
         current = moved(cylinder, basis, step)
-        if reach == 1.5:
-            blur = estimate_blur(current, views, others, basis, view_offset, CHUNK)
-        at, edges = outline_edges(current, views, others, basis, view_offset, reach, blur, CHUNK)
-        if len(at) < 20:
+        at, edges = outline_edges(current, *scene, view_offset, _reach(current, views, FINE_REACH), blur, CHUNK)
+        if len(at) < MIN_STATIONS:
             return None
         solution = _solve(at, edges, len(views), prior, step)
         step = step + solution.step
@@ -95,8 +100,15 @@ def refine(
     share = support_profile(at, hits(at, _moved_by(edges, at, solution), view_offset)).share
     if share < MIN_SUPPORT or refined.radius <= 0:
         return None
-    ends = [find_end(refined, at_end, views, others, basis, view_offset, blur) for at_end in (False, True)]
+    ends = [find_end(refined, at_end, *scene, view_offset, blur) for at_end in (False, True)]
     return _result(refined, solution, share, basis, at, ends)
+
+
+def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:
+    """`pixels`, but less on a thin pipe, whose two outlines and highlight lie within a few pixels."""
+    middle = 0.5 * (cylinder.start + cylinder.end)
+    half_width = [view.camera.fx * cylinder.radius / np.linalg.norm(camera_centre(view) - middle) for view in views]
+    return float(min(pixels, max(0.3 * np.median(half_width), 0.6)))
 
 
 def _vote(
@@ -106,12 +118,12 @@ def _vote(
     others: Sequence[Cylinder],
     basis: FloatArray,
     planned_radii: Sequence[float],
-) -> FloatArray | None:
-    """The step (5,) of `outline.moved` that most edges of all views support."""
+) -> FloatArray:
+    """Steps (K, 5) of `outline.moved` that most edges of all views support, best first; none where no two see it."""
     at = stations(cylinder, views, basis, CHUNK)
     at = at.select(visible(cylinder, others, views, at))
     if len(np.unique(at.view)) < 2 or len(np.unique(at.side)) < 2:
-        return None
+        return np.zeros((0, 5))
     at = at.select(np.arange(0, len(at), max(len(at) // 1500, 1)))
     pixel = 1.0 / float(np.median(at.gain))
     radius = cylinder.radius
@@ -125,8 +137,28 @@ def _vote(
     near = [value - radius for value in planned_radii if abs(value - radius) < thicker]
     seeds = np.zeros((len(near), 5))
     seeds[:, 4] = near
-    best, _ = search(at, response, offsets, reach, seeds, np.random.default_rng(0))
-    return best[0]
+    best = search(at, response, offsets, reach, seeds, np.random.default_rng(0))
+    return distinct(best, at, 0.8, CANDIDATES)
+
+
+def _improved(
+    cylinder: Cylinder,
+    step: FloatArray,
+    scene: tuple[Sequence[View], Sequence[Cylinder], FloatArray],
+    blur: float,
+    prior: FloatArray,
+) -> tuple[FloatArray, float]:
+    """A candidate step after one pass on sub-pixel edges, and the share of stations that it explains."""
+    views, _, basis = scene
+    still: FloatArray = np.zeros(len(views))
+    current = moved(cylinder, basis, step)
+    reach = _reach(current, views, COARSE_REACH)
+    at, edges = outline_edges(current, *scene, still, reach, blur, CHUNK, 1200)
+    if len(at) < MIN_STATIONS:
+        return step, 0.0
+    solution = _solve(at, edges, len(views), prior, step)
+    explained = hits(at, _moved_by(edges, at, solution), solution.view_offset)
+    return step + solution.step, float(explained.mean())
 
 
 @dataclass(frozen=True)

@@ -176,14 +176,17 @@ def outline_profiles(
     reach: float,
     blur: float,
     chunk: int,
+    limit: int | None = None,
 ) -> tuple[Stations, FloatArray, FloatArray]:
     """Stations every `chunk` px on the predicted outlines, offsets (Q,) px and light (N, Q) around them.
 
     Each profile is the mean over its chunk and starts from where the sideways `view_offset` (V,) px of its view puts
-    the outline. Stations behind one of the `others` are left out.
+    the outline. Stations behind one of the `others` are left out, and evenly so many that about `limit` remain.
     """
     at = stations(cylinder, views, basis, chunk, margin=INWARD)
     at = at.select(visible(cylinder, others, views, at))
+    if limit is not None:
+        at = at.select(np.arange(0, len(at), max(len(at) // limit, 1)))
     inward = INWARD
     if len(at):
         inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(at.half_width)))
@@ -203,9 +206,10 @@ def outline_edges(
     reach: float,
     blur: float,
     chunk: int,
+    limit: int | None = None,
 ) -> tuple[Stations, LimbEdges]:
     """Stations as in `outline_profiles` and the edges (from the predicted outline) within `reach` px of them."""
-    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, blur, chunk)
+    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, blur, chunk, limit)
     edges = limb_edges(values, offsets, at.half_width, blur, reach)
     shift = sideways(at) * view_offset[at.view]
     return at, replace(edges, offset=edges.offset + shift[:, None])
@@ -224,11 +228,9 @@ def estimate_blur(
     Surfaces only soften an edge further: of the best values of all views and sides the lowest tenth counts.
     """
     reach = 0.8
-    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, 1.0, chunk)
+    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, 1.0, chunk, 600)
     if not len(at):
         return SHARP
-    chosen = np.arange(0, len(at), max(len(at) // 600, 1))
-    at, values = at.select(chosen), values[chosen]
     trials = np.arange(-reach, reach + 0.1, 0.2, dtype=float)
     left = [_costs(values, offsets, at.half_width, float(blur), trials).min(axis=1) for blur in BLURS]
     cost = np.log(np.stack(left) / _smooth_cost(values, offsets) + 1e-4)
