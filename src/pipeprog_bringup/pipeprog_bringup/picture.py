@@ -23,6 +23,8 @@ BACKGROUND = (247, 248, 250)
 LIFT = 0.025
 # Strength of the shading by depth (eye-dome lighting, Boucheny 2009).
 SHADING = 0.06
+# Height over width at most; what is taller is drawn smaller.
+TALLEST = 1.1
 # What is shown around the pipes [m].
 MARGIN = 0.5
 
@@ -50,8 +52,10 @@ def draw(
     # The cloud is paled, so that the pipes stand out of it.
     pale = np.full((len(cloud), 3), 182.0) if colors is None else 0.55 * colors[shown] + 100
     low, high = _frame(cloud, pipes, axes)
-    pixel = max(high[0] - low[0], 1e-3) / (width * OVERSAMPLING)
-    size = width * OVERSAMPLING, int(np.clip((high[1] - low[1]) / pixel, width / 2, 2.4 * width))
+    reach = high - low
+    pixel = max(reach[0], reach[1] / TALLEST) / (width * OVERSAMPLING)
+    low = low - [(width * OVERSAMPLING * pixel - reach[0]) / 2, 0.0]
+    size = width * OVERSAMPLING, int(max(reach[1] / pixel, width))
     nearest, depth = _splat(cloud @ axes.T, low, pixel, size, _spread(cloud, pixel))
     tints = np.concatenate([[BACKGROUND], pale]).astype(np.uint8)
     image = tints[nearest + 1]
@@ -89,19 +93,24 @@ def _screen_axes(towards_eye: FloatArray) -> FloatArray:
 
 
 def _hiding(points: FloatArray, pipes: Sequence[ColoredPipe], axes: FloatArray) -> float:
-    """Share of the pipes' length, sampled every 5 cm, that has points between it and the eye."""
-    flat = points @ axes.T
-    hidden = total = 0
-    tree = cKDTree(flat[:, :2]) if len(flat) else None
-    for pipe in pipes:
-        steps = np.linspace(0, 1, max(2, int(pipe.cylinder.length / 0.05)))
-        samples = (pipe.cylinder.start + steps[:, None] * (pipe.cylinder.end - pipe.cylinder.start)) @ axes.T
-        total += len(samples)
-        if tree is None:
-            continue
-        for sample, near in zip(samples, tree.query_ball_point(samples[:, :2], 0.03), strict=True):
-            hidden += bool((flat[near, 2] > sample[2] + 1.5 * pipe.cylinder.radius + 0.05).any())
-    return hidden / max(total, 1)
+    """Share of the pipes' length, sampled every 5 cm, with points or another pipe between it and the eye."""
+    samples = [
+        pipe.cylinder.start + steps[:, None] * (pipe.cylinder.end - pipe.cylinder.start)
+        for pipe in pipes
+        for steps in [np.linspace(0, 1, max(2, int(pipe.cylinder.length / 0.05)))]
+    ]
+    if not samples:
+        return 0.0
+    flat = np.concatenate([points, *samples]) @ axes.T
+    tree = cKDTree(flat[:, :2])
+    hidden = 0
+    for pipe, own in zip(pipes, samples, strict=True):
+        across = float(np.linalg.norm(np.cross(pipe.cylinder.axis, axes[2])))
+        surface = pipe.cylinder.radius / max(across, 0.3)
+        for sample in own @ axes.T:
+            near = tree.query_ball_point(sample[:2], max(0.03, pipe.cylinder.radius))
+            hidden += bool((flat[near, 2] > sample[2] + surface + 0.03).any())
+    return hidden / sum(len(own) for own in samples)
 
 
 def _splat(
