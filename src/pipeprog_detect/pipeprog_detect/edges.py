@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -50,8 +51,9 @@ def profiles(views: Sequence[View], at: Stations, offsets: FloatArray, rows: int
         feet = (pixel[:, None] + shifts[None, :, None] * tangent[:, None]).reshape(-1, 1, 2)
         where = feet + offsets[None, :, None] * np.repeat(normal, rows, axis=0)[:, None]
         size = np.array([view.camera.width, view.camera.height])
-        low = np.clip(np.floor(where.min(axis=(0, 1))).astype(int) - 2, 0, size - 1)
-        high = np.clip(np.ceil(where.max(axis=(0, 1))).astype(int) + 3, low + 1, size)
+        tips = where[:, [0, -1]]
+        low = np.clip(np.floor(tips.min(axis=(0, 1))).astype(int) - 2, 0, size - 1)
+        high = np.clip(np.ceil(tips.max(axis=(0, 1))).astype(int) + 3, low + 1, size)
         light = cv2.LUT(np.ascontiguousarray(view.image[low[1] : high[1], low[0] : high[0]]), LINEAR_LIGHT)
         where = (where - low).astype(np.float32)
         sampled = cv2.remap(light, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
@@ -79,21 +81,27 @@ def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
     towards the viewer rises as the square root of the depth (Lambert shading of a circular section). At grazing
     incidence the surface reflects what lies just behind it (Fresnel, in Schlick's form): there the outside shows.
     """
+    grid, columns = _limb_table(half_width, blur, float(np.ceil(np.abs(x).max())))
+    return np.stack([np.interp(x, grid, column) for column in columns], axis=1)
+
+
+@lru_cache(maxsize=256)
+def _limb_table(half_width: float, blur: float, extent: float) -> tuple[FloatArray, FloatArray]:
+    """Distances (G,) within +-`extent` and the model's blurred columns (5, G) there."""
     fine = 0.05
-    reach = 4.0 * blur
-    grid = np.arange(x.min() - reach, x.max() + reach + fine, fine)
+    reach = int(np.ceil(4.0 * blur / fine))
+    count = round(extent / fine) + reach
+    grid = np.arange(-count, count + 1) * fine
     inside = np.clip(0.5 - grid / fine, 0.0, 1.0)
     depth = np.clip(-grid, 0.0, half_width) / half_width
     towards = np.sqrt(depth * (2.0 - depth))
     mirrored = RIM * (1.0 - towards) ** 5 * inside
     body = inside - mirrored
-    columns = np.stack([1.0 - body, (1.0 - inside) * grid / 4.0, body, body * depth * half_width / 4.0, body * towards])
-    half = int(np.ceil(reach / fine))
-    taps = np.arange(-half, half + 1) * fine
-    kernel = np.exp(-0.5 * (taps / blur) ** 2)
+    columns = [1.0 - body, (1.0 - inside) * grid / 4.0, body, body * depth * half_width / 4.0, body * towards]
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * fine / blur) ** 2)
     kernel /= kernel.sum()
-    blurred = [np.convolve(np.pad(column, half, mode="edge"), kernel, mode="valid") for column in columns]
-    return np.stack([np.interp(x, grid, column) for column in blurred], axis=1)
+    blurred = np.stack([np.convolve(column, kernel, mode="valid") for column in columns])
+    return grid[reach : len(grid) - reach], blurred
 
 
 def _costs(

@@ -116,8 +116,12 @@ def _slopes(axis: FloatArray, end: FloatArray, radius: float, along: FloatArray,
         (depth > 0.05) & (pixel > 2).all(axis=1) & (pixel[:, 0] < camera.width - 3) & (pixel[:, 1] < camera.height - 3)
     )
     inside = sharp.reshape(SECTORS, RAYS_PER_SECTOR, -1).all(axis=1)
-    where = pixel.astype(np.float32).reshape(len(angle), len(along), 2)
-    light = cv2.LUT(view.image, LINEAR_LIGHT)
+    if not inside.any():
+        return np.full(inside.shape, np.nan)
+    low = np.maximum(np.floor(pixel[sharp].min(axis=0)).astype(int) - 2, 0)
+    high = np.ceil(pixel[sharp].max(axis=0)).astype(int) + 3
+    light = cv2.LUT(np.ascontiguousarray(view.image[low[1] : high[1], low[0] : high[0]]), LINEAR_LIGHT)
+    where = (pixel - low).astype(np.float32).reshape(len(angle), len(along), 2)
     light = cv2.remap(light, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     mean = light.reshape(SECTORS, RAYS_PER_SECTOR, -1).mean(axis=1, dtype=float)
     return np.where(inside, gaussian_filter1d(mean, SAMPLES_PER_PIXEL, axis=1, order=1), np.nan)
