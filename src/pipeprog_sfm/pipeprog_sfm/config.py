@@ -51,7 +51,11 @@ class StereoConfig:
     )
     width: int = field(
         default=1280,
-        metadata={"description": "width at which images are matched, at most their own", "unit": "px", "range": (160, 4096)},
+        metadata={
+            "description": "width at which images are matched, at most their own",
+            "unit": "px",
+            "range": (160, 4096),
+        },
     )
 
 
@@ -81,7 +85,9 @@ class FusionConfig:
 class SfmConfig:
     """All settings of the reconstruction."""
 
-    seed: int = field(default=0, metadata={"description": "seed of every random choice", "unit": "", "range": (0, 2**31 - 1)})
+    seed: int = field(
+        default=0, metadata={"description": "seed of every random choice", "unit": "", "range": (0, 2**31 - 1)}
+    )
     map_interval: int = field(
         default=5,
         metadata={"description": "keyframes between two publications of the map", "unit": "", "range": (1, 1000)},
