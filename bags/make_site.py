@@ -1,0 +1,148 @@
+"""Make a recording of a synthetic construction site, with its ground truth, bill of quantities and board."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from sitegen.field import build_field
+from sitegen.lab import build_lab
+from sitegen.recording import (
+    FIRST_STAMP,
+    camera_info,
+    truth,
+    write_bag,
+    write_bill,
+    write_boards,
+    write_truth,
+)
+from sitegen.render import Lens, Scene, build_scene
+from sitegen.sensor import Sensor, compress, develop, expose
+from sitegen.visibility import coverage, visible_surface
+from sitegen.walk import Walk
+
+_FOCAL_OVER_WIDTH = 0.714  # 70 degrees across, a phone's main camera
+_SIZES = {"480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
+_PREVIEW_WIDTH = 320  # pixels across, enough for the thinnest pipe at two metres to be two wide
+_LAB_SECONDS = 16.0
+_SURFACE_VIEWS = 20  # about a million points
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+class Layout(str, Enum):
+    """The sites that can be made."""
+
+    lab = "lab"
+    field = "field"
+
+
+class Size(str, Enum):
+    """Image sizes."""
+
+    p480 = "480p"
+    p720 = "720p"
+    p1080 = "1080p"
+    p2160 = "4k"
+
+
+def _frames(
+    scene: Scene, lens: Lens, walk: Walk, sensor: Sensor, times: NDArray[np.float64], seed: int, jobs: int
+) -> Iterator[tuple[int, bytes]]:
+    """Stamps and JPEGs in order; `jobs` frames at a time, each with noise of its own seed."""
+
+    def make(index: int) -> tuple[int, bytes]:
+        linear = expose(scene, lens, walk, sensor, float(times[index]))
+        image = develop(linear, sensor, np.random.default_rng([seed, index]))
+        return FIRST_STAMP + round(float(times[index]) * 1e9), compress(image, sensor)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        for first in range(0, len(times), jobs):
+            yield from pool.map(make, range(first, min(first + jobs, len(times))))
+
+
+@app.command()
+def make_site(
+    layout: Annotated[Layout, typer.Argument(help="lab: six pipes in a room corner; field: 58 in a plant room")],
+    out: Annotated[Path, typer.Argument(help="NAME.mcap; NAME.truth.json, .boq.yaml and .board.yaml go beside it")],
+    seed: Annotated[int, typer.Option(help="layout, textures, hand and noise")] = 1,
+    size: Annotated[Size, typer.Option(help="image size")] = Size.p720,
+    fps: Annotated[float, typer.Option(help="frames per second", min=0.1)] = 5.0,
+    seconds: Annotated[float | None, typer.Option(help="duration; lab: 16, field: the whole walk")] = None,
+    speed: Annotated[float, typer.Option(help="walking speed, m/s", min=0.01)] = 0.75,
+    distance: Annotated[float, typer.Option(help="from the wall, m", min=0.5, max=3.5)] = 2.0,
+    wobble: Annotated[float, typer.Option(help="unsteadiness of the hand: 0 a rail, 1 a careful person", min=0)] = 1.0,
+    richness: Annotated[float, typer.Option(help="texture: 1 rich, 0.2 freshly painted, 0 none", min=0, max=2)] = 1.0,
+    tiled: Annotated[float, typer.Option(help="metres after which the walls' texture repeats, 0 never", min=0)] = 0.0,
+    exposure_ms: Annotated[float, typer.Option(help="exposure time: motion blur", min=0)] = 0.0,
+    readout_ms: Annotated[float, typer.Option(help="rolling shutter, first to last row", min=0)] = 0.0,
+    blur: Annotated[float, typer.Option(help="lens blur, sigma in pixels", min=0)] = 0.6,
+    noise: Annotated[float, typer.Option(help="image noise, sigma in grey levels", min=0)] = 1.0,
+    quality: Annotated[int, typer.Option(help="JPEG quality", min=1, max=100)] = 92,
+    distortion: Annotated[str, typer.Option(help="plumb_bob k1,k2,p1,p2,k3 of the lens")] = "0,0,0,0,0",
+    hide_distortion: Annotated[bool, typer.Option(help="CameraInfo says there is no distortion")] = False,
+    focal_error: Annotated[float, typer.Option(help="percent by which CameraInfo's focal length is off")] = 0.0,
+    surface: Annotated[bool, typer.Option(help="also NAME.surface.npz: true surface points and their pipes")] = False,
+    allow_hidden: Annotated[bool, typer.Option(help="accept a recording that does not show every pipe")] = False,
+    jobs: Annotated[int, typer.Option(help="frames rendered at a time", min=1)] = 1,
+) -> None:
+    """Build a site from a seed, walk a camera through it, and write what it sees and what is true."""
+    console = Console(stderr=True)
+    try:
+        k1, k2, p1, p2, k3 = (float(value) for value in distortion.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"'{distortion}': give five numbers, k1,k2,p1,p2,k3") from None
+    width, height = _SIZES[size.value]
+    focal = _FOCAL_OVER_WIDTH * width
+    lens = Lens(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, (k1, k2, p1, p2, k3))
+
+    rng = np.random.default_rng(seed)
+    build = build_lab if layout == Layout.lab else build_field
+    site = build(rng, richness, tiled, distance)
+    scene = build_scene(site.primitives, site.lamps, site.ambient, seed)
+    walk = Walk(site.waypoints, speed, rng, site.closed_walk, wobble)
+    if seconds is None:
+        seconds = _LAB_SECONDS if layout == Layout.lab else walk.duration
+    times = np.arange(max(math.floor(seconds * fps), 1)) / fps
+    poses = walk.poses(times)
+
+    preview = lens.reduced(max(width // _PREVIEW_WIDTH, 1))
+    seen = coverage(scene, site.pipes, preview, poses)
+    hidden = [
+        f"pipe {k} ({site.pipes[k].radius * 1e3:g} mm): {c.frames} frames, {100 * c.share:.0f} % of its length"
+        for k, c in enumerate(seen)
+        if not c.enough
+    ]
+    if hidden:
+        console.print("hardly seen:", *hidden, sep="\n  ")
+        if not allow_hidden:
+            console.print("choose another seed, a longer walk or more frames, or pass --allow-hidden")
+            raise typer.Exit(1)
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    stem = out.with_suffix("")
+    sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain)
+    frames = _frames(scene, lens, walk, sensor, times, seed, jobs)
+    shown = track(frames, total=len(times), description=out.name, console=console)
+    write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown)
+    write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses))
+    write_bill(Path(f"{stem}.boq.yaml"), site)
+    write_boards(Path(f"{stem}.board.yaml"), site)
+    if surface:
+        points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
+        np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
+    console.print(f"{out}: {len(times)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,1 @@
+"""Synthetic construction sites: geometry, textures, a ray caster and a writer of recordings with ground truth."""

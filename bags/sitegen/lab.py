@@ -1,0 +1,101 @@
+"""The lab: a room corner with six pipes of five radii, an elbow, clamps, a duct and one board."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sitegen.primitives import Material, bend_tangent, unit
+from sitegen.site import (
+    BEND,
+    CONCRETE,
+    COPPER,
+    GALVANISED,
+    LAB_RADII,
+    PIPE_MATERIALS,
+    PLASTER,
+    SCREED,
+    Site,
+)
+
+_ELBOW_RADIUS = 0.0365  # the class that comes twice, once with an elbow
+_WIDTH, _HEIGHT, _DEPTH = 5.0, 3.0, 4.5
+
+
+def _material(radius: float, rng: np.random.Generator) -> Material:
+    return COPPER if radius < 0.02 else PIPE_MATERIALS[int(rng.integers(len(PIPE_MATERIALS)))]
+
+
+def build_lab(rng: np.random.Generator, richness: float, wall_period: float, distance: float) -> Site:
+    """Wall y = 0 with the pipes before it (y < 0), side wall x = 0, floor z = 0; seen from about y = -distance."""
+    site = Site(LAB_RADII, richness, wall_period)
+    site.wall((_WIDTH / 2, 0.0, _HEIGHT / 2), (0, -1, 0), _WIDTH, _HEIGHT, CONCRETE)
+    site.wall((0.0, -_DEPTH / 2, _HEIGHT / 2), (1, 0, 0), _DEPTH, _HEIGHT, PLASTER)
+    site.wall((_WIDTH / 2, -_DEPTH / 2, 0.0), (0, 0, 1), _WIDTH, _DEPTH, SCREED)
+
+    radii = [float(radius) for radius in rng.permutation(LAB_RADII)]
+    standing, lying = radii[:3], [*radii[3:], _ELBOW_RADIUS]
+
+    x = rng.uniform(0.12, 0.25)
+    for radius in standing:
+        x += radius
+        y = -(radius + rng.uniform(0.025, 0.075))
+        on_floor = rng.random() < 0.4
+        bottom = 0.0 if on_floor else rng.uniform(0.15, 0.40)
+        top = rng.uniform(1.75, 2.10)
+        lean = np.tan(np.radians(rng.uniform(-0.7, 0.7))) * (top - bottom)
+        ends = ("floor" if on_floor else "free", "free")
+        pipe = site.pipe((x, y, bottom), (x + lean, y, top), radius, _material(radius, rng), ends)
+        for share in (rng.uniform(0.12, 0.25), rng.uniform(0.75, 0.88)):
+            site.clamp(pipe, share * (top - bottom), (0, 1, 0), -y)
+        x += radius + rng.uniform(0.14, 0.28)
+
+    left = x + rng.uniform(0.02, 0.10)
+    heights = rng.permutation(np.linspace(0.55, 1.72, 3) + rng.uniform(-0.08, 0.08, 3))
+    for k, (radius, z) in enumerate(zip(lying, heights, strict=True)):
+        start = left + rng.uniform(0.0, 0.15)
+        end = start + rng.uniform(1.20, 1.55)
+        y = -(radius + rng.uniform(0.025, 0.075))
+        slope = math.tan(math.radians(rng.uniform(-1.0, 1.0))) * (end - start)
+        m = _material(radius, rng)
+        a, b = np.array([start, y, z]), np.array([end, y, z + slope])
+        ends = ("free", "free")
+        if k == len(lying) - 1:
+            axis, down = unit(b - a), np.array([0.0, 0.0, -1.0])
+            tangent = bend_tangent(axis, down, BEND * radius)
+            site.elbow(b, axis, down, radius, m)
+            site.decoy(b + tangent * down, b + (tangent + 0.12) * down, radius, m)
+            b = b - tangent * axis
+            ends = ("free", "elbow")
+        pipe = site.pipe(a, b, radius, m, ends)
+        length = float(np.linalg.norm(b - a))
+        for share in (rng.uniform(0.12, 0.25), rng.uniform(0.70, 0.85)):
+            site.clamp(pipe, share * length, (0, 1, 0), -y)
+
+    centre = left + rng.uniform(0.4, 1.0)
+    site.board((centre, 0.0, rng.uniform(2.02, 2.10) + 0.05), (0, -1, 0))
+    site.box((left - 0.1, -0.24, 2.50), (_WIDTH - 0.2, -0.03, 2.72), GALVANISED)
+
+    lamp = rng.uniform(-0.4, 0.4)
+    site.tube_lamp((1.0 + lamp, -1.9, 2.85), (2.4 + lamp, -1.9, 2.85), 3.2, 3)
+    site.tube_lamp((3.9, -3.2, 2.3), (3.9, -3.2, 2.3), 2.6, 1)
+    site.ambient = 0.35
+    site.gain = 0.75
+
+    y, right = -distance, max(left + 1.1, 2.4)
+    high, low = 1.62, 1.00
+    turn = math.radians(9.0)
+    site.waypoints = [
+        [0.45, y, high, 0.0, 0.03],
+        [1.1, y - 0.06, high + 0.03, -turn, 0.05],
+        [1.8, y, high, 0.0, 0.06],
+        [right, y - 0.04, high - 0.02, turn, 0.03],
+        [right + 0.25, y, (high + low) / 2, turn, 0.0],
+        [right - 0.05, y + 0.04, low, turn, 0.0],
+        [1.7, y - 0.06, low - 0.05, -turn / 2, -0.02],
+        [0.95, y, low, -turn, 0.02],
+        [0.35, y - 0.05, (high + low) / 2, -turn, 0.0],
+    ]
+    site.closed_walk = True
+    return site

@@ -1,0 +1,128 @@
+"""A recording on disk: NAME.mcap with images and calibration, and NAME.truth.json, .boq.yaml, .board.yaml."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap_ros2.writer import Writer
+from numpy.typing import NDArray
+
+from sitegen.render import Lens
+from sitegen.site import BOARD_CENTRES, BOARD_CIRCLE_RADIUS, CLASSES, Site
+
+FloatArray = NDArray[np.float64]
+
+FRAME_ID = "camera_optical"
+FIRST_STAMP = 1_700_000_000_000_000_000
+_SECOND = 1_000_000_000
+
+_TIME = "int32 sec\nuint32 nanosec\n"
+_HEADER = "builtin_interfaces/Time stamp\nstring frame_id\n"
+_RULE = "=" * 80 + "\n"
+_COMMON = f"{_RULE}MSG: std_msgs/Header\n{_HEADER}{_RULE}MSG: builtin_interfaces/Time\n{_TIME}"
+_IMAGE = "std_msgs/Header header\nstring format\nuint8[] data\n" + _COMMON
+_INFO = (
+    "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n"
+    "float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n"
+    + _COMMON
+    + f"{_RULE}MSG: sensor_msgs/RegionOfInterest\n"
+    "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n"
+)
+
+
+def camera_info(lens: Lens, focal_error: float, leave_out_distortion: bool) -> dict[str, Any]:
+    """The CameraInfo that a calibration would have given; `focal_error` is relative. No header."""
+    fx, fy = lens.fx * (1 + focal_error), lens.fy * (1 + focal_error)
+    return {
+        "height": lens.height,
+        "width": lens.width,
+        "distortion_model": "plumb_bob",
+        "d": [0.0] * 5 if leave_out_distortion else list(lens.distortion),
+        "k": [fx, 0.0, lens.cx, 0.0, fy, lens.cy, 0.0, 0.0, 1.0],
+        "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "p": [fx, 0.0, lens.cx, 0.0, 0.0, fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+    }
+
+
+def write_bag(path: Path, info: dict[str, Any], frames: Iterable[tuple[int, bytes]]) -> None:
+    """Write (stamp in ns, JPEG bytes) with one CameraInfo each, at equal stamps; a file under its name is complete."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as stream, Writer(stream) as writer:
+        image_schema = writer.register_msgdef("sensor_msgs/msg/CompressedImage", _IMAGE)
+        info_schema = writer.register_msgdef("sensor_msgs/msg/CameraInfo", _INFO)
+        for sequence, (stamp, data) in enumerate(frames):
+            header = {"stamp": {"sec": stamp // _SECOND, "nanosec": stamp % _SECOND}, "frame_id": FRAME_ID}
+            times = {"log_time": stamp, "publish_time": stamp, "sequence": sequence}
+            writer.write_message("/camera/camera_info", info_schema, {"header": header, **info}, **times)
+            image = {"header": header, "format": "jpeg", "data": data}
+            writer.write_message("/camera/image/compressed", image_schema, image, **times)
+    part.replace(path)
+
+
+def truth(site: Site, lens: Lens, fps: float, poses: FloatArray) -> dict[str, Any]:
+    """What is true of a recording, as plain values; (N, 4, 4) poses at the middle of each exposure."""
+    return {
+        "width": lens.width,
+        "height": lens.height,
+        "fps": fps,
+        "fx": lens.fx,
+        "fy": lens.fy,
+        "cx": lens.cx + 0.5,
+        "cy": lens.cy + 0.5,
+        "distortion": list(lens.distortion),
+        "planned_radii": list(site.planned_radii),
+        "pipes": [
+            {
+                "id": index,
+                "start": pipe.start.tolist(),
+                "end": pipe.end.tolist(),
+                "radius": pipe.radius,
+                "length": pipe.length,
+                "material": pipe.material,
+                "ends": list(pipe.ends),
+            }
+            for index, pipe in enumerate(site.pipes)
+        ],
+        "ignore": [{"start": a.tolist(), "end": b.tolist(), "radius": r} for a, b, r in site.ignored],
+        "boards": [board.tolist() for board in site.boards],
+        "board_radius": BOARD_CIRCLE_RADIUS,
+        "camera_to_world": poses.tolist(),
+        "note": "metres; camera_to_world: optical frame, one per image, at the middle of its exposure; "
+        "cx, cy: corner convention (ROS CameraInfo is 0.5 less); board_radius: circle radius",
+    }
+
+
+def write_truth(path: Path, values: dict[str, Any]) -> None:
+    """Write the truth as one JSON document."""
+    path.write_text(json.dumps(values) + "\n", encoding="utf-8")
+
+
+def write_bill(path: Path, site: Site) -> None:
+    """Write the bill of quantities."""
+    lines = ["classes:"]
+    for radius, metres in site.planned_lengths().items():
+        name, colour = CLASSES[radius]
+        lines.append(
+            f"  - {{name: {name}, outer_radius_mm: {radius * 1e3:g}, planned_length_m: {metres}, color: {colour}}}"
+        )
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_boards(path: Path, site: Site) -> None:
+    """Write the boards' circle centres, in each board's own frame."""
+    centres = ", ".join(f"[{x * 1e3:g}, {y * 1e3:g}]" for x, y in BOARD_CENTRES)
+    lines = ["boards:"]
+    for name in "ABCDEFGH"[: len(site.boards)]:
+        lines += [
+            f"  - name: {name}",
+            f"    circle_radius_mm: {BOARD_CIRCLE_RADIUS * 1e3:g}",
+            f"    centres_mm: [{centres}]",
+        ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,272 @@
+"""Images of a site: one ray through the middle of each pixel, sixteen where it meets an outline or a shadow's edge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sitegen.primitives import Material, Primitive
+from sitegen.raycast import STACK, Hit, IntArray, PackedTree, Tree, blocked, build_tree, nearest
+from sitegen.textures import relief
+
+FloatArray = NDArray[np.float64]
+FloatImage = NDArray[np.float32]
+
+_EDGE_SAMPLES = 16
+_BORE = 0.9  # inner over outer radius, as the end of a pipe shows it
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """Point light; `power` is the irradiance at 1 m, linear. Several close together make a soft shadow."""
+
+    position: tuple[float, float, float]
+    power: float
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The true camera: ROS pixel convention (integers at pixel centres), plumb_bob distortion k1 k2 p1 p2 k3."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def row(self) -> FloatArray:
+        """fx, fy, cx, cy and the five coefficients."""
+        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+
+    def reduced(self, factor: int) -> Lens:
+        """The same view with `factor` times fewer pixels each way."""
+        return Lens(
+            self.width // factor,
+            self.height // factor,
+            self.fx / factor,
+            self.fy / factor,
+            (self.cx + 0.5) / factor - 0.5,
+            (self.cy + 0.5) / factor - 0.5,
+            self.distortion,
+        )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything the renderer needs, in flat arrays."""
+
+    tree: Tree
+    materials: FloatArray  # (P, 13), one row per primitive
+    seeds: IntArray  # (P,)
+    pipes: IntArray  # (P,) index of the true pipe or -1
+    lamps: FloatArray  # (L, 4) position and power
+    ambient: float
+
+
+def build_scene(primitives: Sequence[Primitive], lamps: Sequence[Lamp], ambient: float, seed: int) -> Scene:
+    """Pack primitives and lamps; every primitive gets a texture seed of its own."""
+    materials: list[Material] = [p.material for p in primitives]
+    return Scene(
+        build_tree(primitives),
+        np.array([m.row() for m in materials]),
+        np.array([1000 * seed + 7919 * k for k in range(len(primitives))], np.int64) % 2**31,
+        np.array([p.pipe for p in primitives], np.int64),
+        np.array([[*lamp.position, lamp.power] for lamp in lamps]),
+        ambient,
+    )
+
+
+def _edge_pattern() -> FloatArray:
+    """(16, 2) offsets in a pixel, all columns and rows distinct, so that no edge direction is quantised coarsely."""
+    bits = np.array([int(f"{i:04b}"[::-1], 2) for i in range(_EDGE_SAMPLES)])
+    return np.c_[(np.arange(_EDGE_SAMPLES) + 0.5), bits + 0.5] / _EDGE_SAMPLES - 0.5
+
+
+@njit(nogil=True)
+def _direction(u: float, v: float, lens: FloatArray) -> tuple[float, float, float]:
+    """Unit direction, in the optical frame, of the ray through a pixel (distortion inverted by fixed point)."""
+    xd, yd = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
+    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
+    x, y = xd, yd
+    if k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0:
+        for _ in range(100):
+            r2 = x * x + y * y
+            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            nx = (xd - 2.0 * p1 * x * y - p2 * (r2 + 2.0 * x * x)) / radial
+            ny = (yd - p1 * (r2 + 2.0 * y * y) - 2.0 * p2 * x * y) / radial
+            moved = abs(nx - x) + abs(ny - y)
+            x, y = nx, ny
+            if moved < 1e-10:
+                break
+    n = 1.0 / math.sqrt(x * x + y * y + 1.0)
+    return x * n, y * n, n
+
+
+@njit(nogil=True)
+def _cast(
+    tree: PackedTree, pose: FloatArray, lens: FloatArray, u: float, v: float, stack: IntArray
+) -> tuple[int, Hit, float, float, float]:
+    """Nearest hit along a pixel's ray: (index, hit, world direction)."""
+    cx, cy, cz = _direction(u, v, lens)
+    dx = pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2] * cz
+    dy = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz
+    dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz
+    p, hit = nearest(tree, stack, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz)
+    return p, hit, dx, dy, dz
+
+
+@njit(nogil=True)
+def _shade(
+    tree: PackedTree,
+    materials: FloatArray,
+    seeds: IntArray,
+    lamps: FloatArray,
+    ambient: float,
+    pose: FloatArray,
+    lens: FloatArray,
+    u: float,
+    v: float,
+    stack: IntArray,
+) -> tuple[float, float, float, int]:
+    """Linear colour of a pixel position and a label that changes across outlines, creases and shadow edges."""
+    kinds, geometry = tree[0], tree[1]
+    p, hit, dx, dy, dz = _cast(tree, pose, lens, u, v, stack)
+    if p < 0:
+        sky = 0.25 + 0.05 * dz
+        return sky, sky, sky, -1
+    t, x, y, z, lx, ly, lz, part = hit
+    g = geometry[p]
+    material = materials[p]
+    nx = g[3] * lx + g[6] * ly + g[9] * lz
+    ny = g[4] * lx + g[7] * ly + g[10] * lz
+    nz = g[5] * lx + g[8] * ly + g[11] * lz
+    facing = -(nx * dx + ny * dy + nz * dz)
+    # A pixel's side on the surface: the geometric mean of its sides across and along the slope.
+    footprint = t / lens[0] / math.sqrt(max(facing, 0.1))
+    factor = relief(material, x, y, z, footprint, seeds[p])
+    if kinds[p] == 3 and part == 1 and x * x + y * y < (_BORE * g[12]) ** 2:
+        factor *= 0.12
+        part = 2
+    wx, wy, wz = pose[0, 3] + t * dx, pose[1, 3] + t * dy, pose[2, 3] + t * dz
+    ox, oy, oz = wx + 1e-5 * nx, wy + 1e-5 * ny, wz + 1e-5 * nz
+    diffuse = ambient * (0.8 + 0.2 * nz)
+    gloss = 0.0
+    shadows = 0
+    for k in range(len(lamps)):
+        sx, sy, sz = lamps[k, 0] - wx, lamps[k, 1] - wy, lamps[k, 2] - wz
+        d2 = sx * sx + sy * sy + sz * sz
+        d = math.sqrt(d2)
+        sx, sy, sz = sx / d, sy / d, sz / d
+        cosine = nx * sx + ny * sy + nz * sz
+        if cosine <= 0.0:
+            continue
+        if blocked(tree, stack, ox, oy, oz, sx, sy, sz, d):
+            shadows |= 1 << k
+            continue
+        power = lamps[k, 3] / d2
+        diffuse += power * cosine
+        if material[10] > 0.0:
+            hx, hy, hz = sx - dx, sy - dy, sz - dz
+            h = math.sqrt(hx * hx + hy * hy + hz * hz)
+            peak = max((nx * hx + ny * hy + nz * hz) / h, 0.0)
+            gloss += power * material[10] * peak ** material[11]
+    gloss *= factor
+    diffuse *= factor
+    label = ((p * 8 + part) << 8) | shadows
+    return material[0] * diffuse + gloss, material[1] * diffuse + gloss, material[2] * diffuse + gloss, label
+
+
+@njit(nogil=True)
+def _render(
+    tree: PackedTree,
+    materials: FloatArray,
+    seeds: IntArray,
+    lamps: FloatArray,
+    ambient: float,
+    poses: FloatArray,
+    lens: FloatArray,
+    pattern: FloatArray,
+    image: FloatImage,
+    labels: IntArray,
+) -> None:
+    """Fill `image` (H, W, 3) and `labels` (H, W); `poses` (H, 3, 4) hold the pose while each row is read."""
+    height, width = labels.shape
+    stack = np.empty(STACK, np.int64)
+    for r in range(height):
+        for c in range(width):
+            a, b, d, label = _shade(tree, materials, seeds, lamps, ambient, poses[r], lens, float(c), float(r), stack)
+            image[r, c, 0], image[r, c, 1], image[r, c, 2] = a, b, d
+            labels[r, c] = label
+    count = len(pattern)
+    for r in range(height):
+        for c in range(width):
+            edge = False
+            for rr in range(max(r - 1, 0), min(r + 2, height)):
+                for cc in range(max(c - 1, 0), min(c + 2, width)):
+                    edge = edge or labels[rr, cc] != labels[r, c]
+            if not edge:
+                continue
+            sa, sb, sd = 0.0, 0.0, 0.0
+            for k in range(count):
+                a, b, d, label = _shade(
+                    tree, materials, seeds, lamps, ambient, poses[r], lens, c + pattern[k, 0], r + pattern[k, 1], stack
+                )
+                sa, sb, sd = sa + a, sb + b, sd + d
+            image[r, c, 0], image[r, c, 1], image[r, c, 2] = sa / count, sb / count, sd / count
+
+
+@njit(nogil=True)
+def _trace(
+    tree: PackedTree,
+    pose: FloatArray,
+    lens: FloatArray,
+    primitives: IntArray,
+    points: FloatArray,
+    depths: FloatArray,
+) -> None:
+    height, width = primitives.shape
+    stack = np.empty(STACK, np.int64)
+    for r in range(height):
+        for c in range(width):
+            p, hit, dx, dy, dz = _cast(tree, pose, lens, float(c), float(r), stack)
+            primitives[r, c] = p
+            depths[r, c] = hit[0]
+            if p >= 0:
+                points[r, c, 0] = pose[0, 3] + hit[0] * dx
+                points[r, c, 1] = pose[1, 3] + hit[0] * dy
+                points[r, c, 2] = pose[2, 3] + hit[0] * dz
+
+
+def render(scene: Scene, lens: Lens, row_poses: FloatArray) -> FloatImage:
+    """Linear RGB image (H, W, 3) float32, unclipped; `row_poses` (H, 4, 4) are world_from_camera for each row."""
+    image = np.empty((lens.height, lens.width, 3), np.float32)
+    labels = np.empty((lens.height, lens.width), np.int64)
+    _render(
+        scene.tree.packed(),
+        scene.materials,
+        scene.seeds,
+        scene.lamps,
+        scene.ambient,
+        np.ascontiguousarray(row_poses[:, :3]),
+        lens.row(),
+        _edge_pattern(),
+        image,
+        labels,
+    )
+    return image
+
+
+def trace(scene: Scene, lens: Lens, pose: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """What each pixel's ray hits first: primitive (H, W) or -1, world point (H, W, 3), range (H, W) in metres."""
+    primitives = np.empty((lens.height, lens.width), np.int64)
+    points = np.full((lens.height, lens.width, 3), np.nan)
+    ranges = np.empty((lens.height, lens.width))
+    _trace(scene.tree.packed(), np.ascontiguousarray(pose[:3]), lens.row(), primitives, points, ranges)
+    return primitives, points, ranges

@@ -1,0 +1,59 @@
+"""What of a site a recording shows: coverage of each pipe, and the true surface the camera saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitegen.render import Lens, Scene, trace
+from sitegen.site import Pipe
+
+FloatArray = NDArray[np.float64]
+
+_STEP = 0.02  # metres along a pipe that count as seen together
+_MIN_FRAMES = 3  # two views make a depth, a third confirms it
+_MIN_SHARE = 0.6
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How a pipe was seen: frames with any of it, share of its length seen in at least three of them."""
+
+    frames: int
+    share: float
+
+    @property
+    def enough(self) -> bool:
+        """Whether a recording with this pipe is a fair test."""
+        return self.frames >= _MIN_FRAMES and self.share >= _MIN_SHARE
+
+
+def coverage(scene: Scene, pipes: Sequence[Pipe], lens: Lens, poses: FloatArray) -> list[Coverage]:
+    """Coverage of every pipe over (N, 4, 4) poses."""
+    bins = [np.zeros(max(int(np.ceil(p.length / _STEP)), 1), np.int64) for p in pipes]
+    frames = np.zeros(len(pipes), np.int64)
+    axes = [(p.end - p.start) / p.length for p in pipes]
+    for pose in poses:
+        hit, points, _ = trace(scene, lens, pose)
+        owner = np.where(hit >= 0, scene.pipes[hit], -1)
+        for index in np.unique(owner[owner >= 0]):
+            along = (points[owner == index] - pipes[index].start) @ axes[index]
+            seen = np.unique(np.clip((along / _STEP).astype(np.int64), 0, len(bins[index]) - 1))
+            bins[index][seen] += 1
+            frames[index] += 1
+    return [Coverage(int(n), float(np.mean(b >= _MIN_FRAMES))) for n, b in zip(frames, bins, strict=True)]
+
+
+def visible_surface(scene: Scene, lens: Lens, poses: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Points (N, 3) of the true surfaces that the poses see, and the pipe (N,) each lies on, or -1."""
+    points: list[NDArray[np.float32]] = []
+    owners: list[NDArray[np.int32]] = []
+    for pose in poses:
+        hit, where, _ = trace(scene, lens, pose)
+        keep = hit >= 0
+        points.append(where[keep].astype(np.float32))
+        owners.append(scene.pipes[hit[keep]].astype(np.int32))
+    return np.concatenate(points), np.concatenate(owners)
