@@ -49,8 +49,8 @@ def adjust(
 
     rotation (C, 3, 3), translation (C, 3): camera_from_world; free (C,): views that may move.
     points (P, 3); observations sorted by point, those of point p in start[p]:start[p + 1], as view (K,) and
-    rays (K, 2), normalised image coordinates; focal (C, 2) px; loss_scale px, of the Cauchy loss. Ends when an iteration gains less than `tolerance` of
-    the cost.
+    rays (K, 2), normalised image coordinates; focal (C, 2) px; loss_scale px, of the Cauchy loss. Ends
+    when an iteration gains less than `tolerance` of the cost.
     """
     index = np.where(free, np.cumsum(free) - 1, -1)
     count = int(free.sum())

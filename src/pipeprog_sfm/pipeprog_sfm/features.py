@@ -12,7 +12,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 
 PIXELS = 600_000  # of the image that is searched: finer detail is mostly noise, and SIFT looks at twice this resolution
-CONTRAST = 0.02  # a third of it per scale layer is the usual SIFT peak threshold of 0.0067
+CONTRAST = 0.004  # a third of it per scale layer is a third of a grey level: bare painted walls show no more
 TILES = (16, 9)  # the strongest of each tile come first, so that a thinly textured part of the image is heard
 
 
