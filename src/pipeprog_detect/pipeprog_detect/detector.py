@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
+from pipeprog_detect.refinement import Jury, Measured
 from pipeprog_detect.runs import elbows, join, near, spanning
 from pipeprog_detect.verify import Candidate, measure, own_points, settle, thin_start
 
@@ -20,6 +22,8 @@ from pipeprog_detect.verify import Candidate, measure, own_points, settle, thin_
 # comes last, when little is left for its many sites.
 _SCALES = (0.028, 0.04, 0.056, 0.08, 0.113, 0.16, 0.02)
 _POINTS_PER_SCALE = 7.0
+# Candidates that the images judge may be so many times as rough as pipes that the cloud alone must vouch for.
+_PROPOSED = 2.0
 # Pipes up to this radius [m] are sought as lines of points, in neighbourhoods several times as wide.
 _THICKEST_LINE = 0.02
 _LINE_SCALE = 0.04
@@ -57,8 +61,12 @@ def detect(
     _, on_plane = background.find_planes(tree, sigma, widest)
     tree = tree.subset(~on_plane)
     planned_radii = [planned.outer_radius for planned in bill.classes]
-    candidates = find_candidates(tree, sigma, (config.radius_min, widest), planned_radii, config, report)
-    pipes = [_pipe(candidate, bill, shift) for candidate in candidates]
+    local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
+    jury = Jury(local_views if config.contour.enabled else [], bill, config.contour)
+    candidates = find_candidates(tree, sigma, (config.radius_min, widest), planned_radii, config, jury, report)
+    report(0.9, "measuring in the keyframes" if views else "measuring")
+    measured = jury.measure(candidates, [is_pipe(candidate, sigma, config) for candidate in candidates])
+    pipes = [_pipe(each, bill, shift) for each in measured]
     report(1.0, "done")
     return _numbered(pipes)
 
@@ -69,15 +77,23 @@ def find_candidates(
     radius_range: tuple[float, float],
     planned_radii: Sequence[float],
     config: DetectConfig,
+    jury: Jury,
     report: Report,
 ) -> list[Candidate]:
-    """Accepted cylinders of the tree's points, none sharing points with another."""
+    """Accepted cylinders of the tree's points, none sharing points with another.
+
+    Clouds of stereo are rougher on pipes than on walls: what is too rough for the cloud alone is put to the images.
+    """
     free = np.ones(len(tree.points), bool)
     accepted: list[Candidate] = []
 
     def consider(initial: Cylinder | None) -> None:
         candidate = measure(tree, free, initial, sigma) if initial is not None else None
-        if candidate is not None and is_pipe(candidate, sigma, config):
+        if candidate is None:
+            return
+        if is_pipe(candidate, sigma, config) or (
+            is_pipe(candidate, sigma, config, _PROPOSED) and jury.vouches_for(candidate)
+        ):
             accepted.append(candidate)
             cylinder = candidate.cylinder
             free[tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)] = False
@@ -121,15 +137,15 @@ def _settled(tree: Octree, accepted: list[Candidate], sigma: float, config: Dete
                 tree.points[rows], cylinder, [other for other in others if near(other, cylinder, reach)]
             )
             candidate = settle(points, cylinder, band, np.inf)
-            if candidate is not None and is_pipe(candidate, sigma, config):
+            if candidate is not None and is_pipe(candidate, sigma, config, _PROPOSED):
                 settled.append(candidate)
         accepted = settled
     bends = elbows([candidate.cylinder for candidate in accepted])
     return [candidate for number, candidate in enumerate(accepted) if number not in bends]
 
 
-def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig) -> bool:
-    """Whether the evidence makes a pipe of a cylinder."""
+def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig, roughness: float = 1.0) -> bool:
+    """Whether the evidence makes a pipe of a cylinder whose surface may be `roughness` times as rough as usual."""
     evidence, cylinder = candidate.evidence, candidate.cylinder
     # The smaller the arc, the more surfaces that are no pipe fit it: its length has to make up for that.
     slender = 3.0 if evidence.arc > np.radians(90.0) else 6.0
@@ -138,15 +154,21 @@ def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig) -> bool:
         and evidence.arc >= np.radians(config.arc_min_deg)
         and evidence.coverage > 0.4
         and evidence.inside < 0.15
-        and evidence.noise < 1.6 * sigma + 8e-4
-        and evidence.roundness < 0.3 * sigma + 0.02 * cylinder.radius + 3e-4
+        and evidence.noise < roughness * (1.6 * sigma + 8e-4)
+        and evidence.roundness < roughness * (0.3 * sigma + 0.02 * cylinder.radius + 3e-4)
         and evidence.flatness > 1.3
     )
 
 
-def _pipe(candidate: Candidate, bill: Bill, shift: FloatArray) -> Pipe:
-    cylinder = candidate.cylinder
-    sigma = candidate.radius_sigma
+def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
+    """The pose for a map whose origin is moved to `shift` (3,)."""
+    pose = camera_from_map.copy()
+    pose[:3, 3] += pose[:3, :3] @ shift
+    return pose
+
+
+def _pipe(measured: Measured, bill: Bill, shift: FloatArray) -> Pipe:
+    candidate, cylinder, sigma = measured.candidate, measured.cylinder, measured.radius_sigma
     name, probability = classify.classify(cylinder.radius, sigma, bill)
     return Pipe(
         "",

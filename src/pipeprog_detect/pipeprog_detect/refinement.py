@@ -1,0 +1,90 @@
+"""The cloud's candidates before the keyframes: measured by their outlines, kept on trust, or dropped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipeprog_detect.bill import Bill
+from pipeprog_detect.classify import classify
+from pipeprog_detect.config import ContourConfig
+from pipeprog_detect.contour import ContourFit, refine
+from pipeprog_detect.pipe import Cylinder, FloatArray, View
+from pipeprog_detect.verify import Candidate
+
+# Outlines of real pipes are supported along more than half of what is seen of them.
+CONVINCING = 0.5
+# The windows in which outlines are sought follow from the radius: where it changes by more, they are placed anew.
+SETTLED, MAX_ROUNDS = 0.1, 3
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A candidate after the images were asked: its cylinder and the standard deviation of its radius [m]."""
+
+    candidate: Candidate
+    cylinder: Cylinder
+    radius_sigma: float
+
+
+class Jury:
+    """The keyframes, and what they say about candidates; without views the cloud's word stands."""
+
+    def __init__(self, views: Sequence[View], bill: Bill, config: ContourConfig) -> None:
+        self._views, self._bill, self._config = views, bill, config
+
+    def vouches_for(self, candidate: Candidate) -> bool:
+        """Whether the keyframes make a pipe of a candidate of which the cloud alone is not sure.
+
+        They must show most of its outlines, and these must have a planned size: shadows have outlines, too.
+        """
+        fit = self._refined(candidate, [])
+        if fit is None or fit.support < CONVINCING:
+            return False
+        return classify(fit.cylinder.radius, fit.radius_sigma, self._bill)[0] is not None
+
+    def measure(self, candidates: Sequence[Candidate], trusted: Sequence[bool]) -> list[Measured]:
+        """The candidates measured by their outlines.
+
+        A candidate without outlines stays as the cloud has it where the cloud alone vouches for it (`trusted`), else
+        it goes. Those with most points come first; what they turn out to be is known when the others are measured.
+        """
+        order = sorted(range(len(candidates)), key=lambda number: -candidates[number].points)
+        current = {number: candidates[number].cylinder for number in order if trusted[number]}
+        found: list[Measured] = []
+        for number in order:
+            candidate = candidates[number]
+            others = [cylinder for other, cylinder in current.items() if other != number]
+            fit = self._refined(candidate, others)
+            if fit is None and self._views and not trusted[number]:
+                continue
+            measured = (
+                Measured(candidate, candidate.cylinder, candidate.radius_sigma)
+                if fit is None
+                else Measured(candidate, fit.cylinder, fit.radius_sigma)
+            )
+            middle = 0.5 * (measured.cylinder.start + measured.cylinder.end)
+            if not any(_contains(known.cylinder, middle) for known in found):
+                current[number] = measured.cylinder
+                found.append(measured)
+        return found
+
+    def _refined(self, candidate: Candidate, others: Sequence[Cylinder]) -> ContourFit | None:
+        if not self._views:
+            return None
+        planned_radii = [planned.outer_radius for planned in self._bill.classes]
+        # The surface may lie as far from its points' mean as they scatter: the cloud's sigma knows of noise alone.
+        sigma = max(candidate.radius_sigma, candidate.evidence.noise)
+        cylinder = candidate.cylinder
+        for _ in range(MAX_ROUNDS):
+            fit = refine(cylinder, sigma, self._views, others, self._config, planned_radii)
+            if fit is None or abs(fit.cylinder.radius - cylinder.radius) < SETTLED * cylinder.radius:
+                break
+            cylinder = fit.cylinder
+        return fit
+
+
+def _contains(cylinder: Cylinder, point: FloatArray) -> bool:
+    along = float((point - cylinder.start) @ cylinder.axis)
+    off_axis = point - cylinder.start - along * cylinder.axis
+    return 0.0 < along < cylinder.length and float(off_axis @ off_axis) < cylinder.radius**2
