@@ -60,7 +60,8 @@ def start(folder: Path, *options: str, fault: str = "", **recording: int) -> sub
     (folder / "boq.yaml").write_text(BOQ)
     arguments = ["replay", str(bag), "--boq", str(folder / "boq.yaml"), "--out", str(folder / "out"), *options]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    environment = {**os.environ, "FAKE": fault, "FAKE_PIDS": str(folder / "pids"), "PYTHONPATH": path}
+    told = {"FAKE": fault, "FAKE_PIDS": str(folder / "pids")}
+    environment = {**os.environ, **told, "PYTHONPATH": path, "TMPDIR": str(folder)}
     return subprocess.Popen(
         [sys.executable, "-c", RUNNER, *arguments],
         cwd=folder,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +17,16 @@ if TYPE_CHECKING:
     from pipeprog_detect.pipe import Pipe
 
 
+def output_console() -> Console:
+    """Where tables go; into a file or a pipe they are as wide as they need to be."""
+    return Console(width=None if sys.stdout.isatty() else 120)
+
+
 def progress_display() -> Progress:
     """Bars with their stage, share and time; nothing but the last state where stderr is no terminal."""
     return Progress(
         SpinnerColumn(),
-        TextColumn("{task.description}", table_column=None),
+        TextColumn("{task.description}"),
         BarColumn(bar_width=30),
         TextColumn("{task.fields[detail]}"),
         TimeElapsedColumn(),
@@ -72,12 +78,12 @@ def print_progress(pipes: Sequence[Pipe], classes: Sequence[ClassProgress]) -> N
     if others:
         total = sum(pipe.cylinder.length for pipe in others)
         table.add_row("[dim]no planned class", "", str(len(others)), f"{total:.2f}", "", "")
-    Console().print(table)
+    output_console().print(table)
 
 
 def print_score(figures: dict[str, Any]) -> None:
     """The figures of `score` as tables."""
-    console = Console()
+    console = output_console()
     table = Table(title=f"Found and classified (aligned by {figures['alignment']})", title_justify="left")
     for name in ("", "true", "false", "missed", "precision", "recall", "F", "accuracy"):
         table.add_column(name, justify="left" if not name else "right")

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import random
+import re
 import signal
 import socket
 import subprocess
@@ -111,8 +112,11 @@ class Graph:
         return self._folder / f"{name}.log"
 
     def _last_words(self, name: str) -> str:
-        lines = self._log(name).read_text(errors="replace").strip().splitlines()
-        return f": {lines[-1].strip()}" if lines else ""
+        """What the node said last: the error that its traceback ends with, or its last line."""
+        lines = [line.strip() for line in self._log(name).read_text(errors="replace").splitlines() if line.strip()]
+        errors = [line for line in lines if re.match(r"([\w.]+(Error|Exception|Interrupt)|error): ", line)]
+        words = (errors or lines)[-1:]
+        return f": {words[0]}" * len(words) + f"\nAll it said: {self._log(name)}" * bool(lines)
 
     @staticmethod
     def _has_ended(process: subprocess.Popen[bytes]) -> bool:

@@ -421,12 +421,16 @@ def _progress(message: msg.ClassProgress) -> ClassProgress:
 
 @contextlib.contextmanager
 def _scratch() -> Iterator[Path]:
-    """A folder for parameter files and logs, gone with the replay."""
+    """A folder for parameter files and logs, gone with the replay; kept where a node failed and its log says why."""
     path = Path(tempfile.mkdtemp(prefix="pipeprog-"))
     try:
         yield path
-    finally:
+    except NodeFailure:
+        raise
+    except BaseException:
         shutil.rmtree(path, ignore_errors=True)
+        raise
+    shutil.rmtree(path, ignore_errors=True)
 
 
 @contextlib.contextmanager
