@@ -115,8 +115,9 @@ class Graph:
         """What the node said last: the error that its traceback ends with, or its last line."""
         lines = [line.strip() for line in self._log(name).read_text(errors="replace").splitlines() if line.strip()]
         errors = [line for line in lines if re.match(r"([\w.]+(Error|Exception|Interrupt)|error): ", line)]
-        words = (errors or lines)[-1:]
-        return f": {words[0]}" * len(words) + f"\nAll it said: {self._log(name)}" * bool(lines)
+        if not lines:
+            return ""
+        return f": {(errors or lines)[-1]}\nAll it said: {self._log(name)}"
 
     @staticmethod
     def _has_ended(process: subprocess.Popen[bytes]) -> bool:

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeprog_bringup.graph import Graph, NodeFailure, private_domain
+
+
+def wait_for_failure(graph: Graph) -> None:
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline:
+        graph.check()
+        time.sleep(0.02)
+
+
+def test_a_node_that_stops_by_itself_is_quoted(tmp_path: Path) -> None:
+    """A module that does not know ROS arguments stands for a node that refuses its parameters."""
+    with Graph({}, tmp_path, {"frames": "json.tool"}) as graph, pytest.raises(NodeFailure) as caught:
+        wait_for_failure(graph)
+    assert "the node frames (process" in str(caught.value)
+    assert "stopped with exit code 2" in str(caught.value)
+    assert "unrecognized arguments" in str(caught.value)
+    assert str(tmp_path / "frames.log") in str(caught.value)
+
+
+def test_two_replays_have_domains_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    with private_domain(tmp_path):
+        first = os.environ.pop("ROS_DOMAIN_ID")
+        with private_domain(tmp_path):
+            assert os.environ["ROS_DOMAIN_ID"] != first
+            assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert "ROS_DOMAIN_ID" not in os.environ
+
+
+def test_a_domain_that_the_user_has_set_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    with private_domain(tmp_path):
+        assert os.environ["ROS_DOMAIN_ID"] == "42"
+    assert os.environ["ROS_DOMAIN_ID"] == "42"
