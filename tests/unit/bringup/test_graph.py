@@ -22,7 +22,7 @@ def test_a_node_that_stops_by_itself_is_quoted(tmp_path: Path) -> None:
         wait_for_failure(graph)
     assert "the node frames (process" in str(caught.value)
     assert "stopped with exit code 2" in str(caught.value)
-    assert "unrecognized arguments" in str(caught.value)
+    assert "json.tool: error: " in str(caught.value)
     assert str(tmp_path / "frames.log") in str(caught.value)
 
 
