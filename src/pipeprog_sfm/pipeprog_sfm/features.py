@@ -38,7 +38,7 @@ def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Fe
     """
     factor = 0.5 if gray.size > PIXELS else 1.0
     small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else gray
-    sift = cv2.SIFT_create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
     found = sift.detect(small, None)
     if not found:
         return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8))

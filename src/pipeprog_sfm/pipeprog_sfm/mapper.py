@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.colmap import absolute_pose, relative_pose
+from pipeprog_sfm.colmap import AbsolutePose, absolute_pose, relative_pose
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features import Features, extract
 from pipeprog_sfm.matching import MatchArray, match, match_guided
@@ -26,11 +26,18 @@ START_ANGLE = np.radians(3.0)  # median between the rays of its points
 GUIDED_RADIUS = 4.0  # px around the epipolar segment
 TEMPORAL = 3  # neighbours in time that every keyframe is matched with
 COVISIBLE = 5  # further views by predicted overlap
+DEPTH_TOLERANCE = 0.05  # of a point's depth in two models: its noise at the smallest angle
 LOCAL_WINDOW = 8  # views that local bundle adjustment moves
 GROWTH = 1.3  # in views, between two global adjustments
+MIN_SHARE = 0.25  # of the matches with the neighbours that a pose must agree with
+RIVAL = 0.5  # of a pose's inliers: as many that agree on another pose make it ambiguous, as repeated texture does
+RETRIEVED = 6  # views of a model that a lost keyframe is compared with, others each time: the cost stays bounded
+ALIKE = 3  # of these that are matched in full
+GLANCE = 400  # features that such a comparison takes
 RETRIES = 3  # waiting keyframes tried again with each new one
 START_CANDIDATES = 8  # waiting keyframes that a new one may start a model with
 GRID = (32, 18)
+NO_STAMP = -1
 
 
 @dataclass(frozen=True)
@@ -76,6 +83,16 @@ class _Keyframe:
     focal: FloatArray
 
 
+@dataclass(frozen=True)
+class _Location:
+    """A keyframe's pose in a model (None: the reason says why), its (feature, point) pairs, matches by stamp."""
+
+    camera_from_model: FloatArray | None
+    pairs: IntArray
+    evidence: dict[int, MatchArray]
+    reason: str
+
+
 class Mapper:
     """Registers each keyframe as it comes; the published model is the largest connected one."""
 
@@ -85,8 +102,9 @@ class Mapper:
         self._keyframes: dict[int, _Keyframe] = {}
         self._waiting: list[int] = []
         self._models: list[SparseModel] = []
-        self._adjusted: dict[int, int] = {}
-        self._tied: dict[int, FrameTie] = {}
+        self._evidence: dict[int, dict[int, MatchArray]] = {}
+        self._cursor = 0
+        self._tied: dict[int, tuple[int | None, int, int | None]] = {}
 
     @property
     def seen(self) -> int:
@@ -126,16 +144,14 @@ class Mapper:
         keyframe = _Keyframe(stamp, features, camera, rays, np.array([camera.fx, camera.fy]))
         self._keyframes[stamp] = keyframe
         report = self._register_anywhere(keyframe)
-        if report.registered:
-            self._retry(stamp)
-            return report
-        self._waiting.append(stamp)
-        if self._start(keyframe):
-            self._retry(stamp)
-            model = next(model for model in self._models if stamp in model.stamps)
-            view = model.stamps.index(stamp)
-            return self._registered(model, view)
-        return report
+        if not report.registered:
+            self._waiting.append(stamp)
+            if not self._start(keyframe):
+                return report
+        self._retry(stamp)
+        if len(self._models) > 1:
+            self._merge(stamp)
+        return self._report(stamp)
 
     def finish(self) -> None:
         """Tries the waiting keyframes once more and adjusts everything."""
@@ -146,10 +162,9 @@ class Mapper:
             for stamp in list(self._waiting):
                 if self._register_anywhere(self._keyframes[stamp]).registered:
                     self._waiting.remove(stamp)
-            if len(self._waiting) == before:
+            if len(self._waiting) >= before:
                 break
         for model in self._models:
-            self._complete(model)
             self._adjust_globally(model)
 
     def camera_from_model(self) -> dict[int, FloatArray]:
@@ -179,6 +194,13 @@ class Mapper:
         seen = own >= 0
         return number[own[seen]], self._keyframes[stamp].features.keypoints[seen].astype(np.float64)
 
+    def depths(self, stamp: int) -> FloatArray:
+        """(K,) depths, in the model's unit, of the points that a keyframe of the published model sees."""
+        model = self._published
+        view = model.stamps.index(stamp)
+        own = model.point_of[model.features(view)]
+        return model.points[own[own >= 0]] @ model.rotation[view, 2] + model.translation[view, 2]
+
     def neighbours(self, stamp: int) -> list[tuple[int, int]]:
         """(stamp, shared points) of the published model's keyframes that share points, most first."""
         model = self._published
@@ -188,92 +210,143 @@ class Mapper:
 
     def ties(self) -> list[FrameTie]:
         """Overlap of the keyframes for which it changed since the last call."""
+        model = self._published if self._models else SparseModel()
+        view_of = {stamp: view for view, stamp in enumerate(model.stamps)}
+        stamps = sorted(self._keyframes)
+        tied = {stamp: model.point_of[model.features(view_of[stamp])] for stamp in stamps if stamp in view_of}
+        marks = {stamp: hash(tied[stamp].tobytes()) if stamp in tied else 0 for stamp in stamps}
         changed = []
-        for stamp, tie in self._all_ties().items():
-            if self._tied.get(stamp) != tie:
-                changed.append(tie)
-                self._tied[stamp] = tie
+        for before, stamp, after in zip([NO_STAMP, *stamps[:-1]], stamps, [*stamps[1:], NO_STAMP], strict=True):
+            mark = (marks.get(before), marks[stamp], marks.get(after))
+            if self._tied.get(stamp) != mark:
+                self._tied[stamp] = mark
+                changed.append(self._tie(stamp, tied.get(before), tied.get(stamp), tied.get(after)))
         return changed
 
-    def _all_ties(self) -> dict[int, FrameTie]:
-        ties = {}
-        model = self._published if self._models else SparseModel()
-        view_of_stamp = {stamp: view for view, stamp in enumerate(model.stamps)}
-        previous: set[int] = set()
-        stamps = sorted(self._keyframes)
-        seen_points = {
-            stamp: model.point_of[model.features(view_of_stamp[stamp])] if stamp in view_of_stamp else np.empty(0, int)
-            for stamp in stamps
-        }
-        del previous
-        shared = [
-            len(np.intersect1d(seen_points[a][seen_points[a] >= 0], seen_points[b][seen_points[b] >= 0]))
-            for a, b in zip(stamps[:-1], stamps[1:], strict=True)
-        ]
-        for n, stamp in enumerate(stamps):
-            keyframe = self._keyframes[stamp]
-            keypoints = keyframe.features.keypoints
-            tied = seen_points[stamp] >= 0
-            size = (keyframe.camera.width, keyframe.camera.height)
-            inside = keypoints[tied] if len(tied) else keypoints[:0]
-            ties[stamp] = FrameTie(
-                stamp,
-                stamp in view_of_stamp,
-                _hull(inside) / max(_hull(keypoints), 1e-9),
-                _cells(inside, size) / max(_cells(keypoints, size), 1),
-                len(inside),
-                len(keypoints),
-                shared[n - 1] if n else 0,
-                shared[n] if n < len(shared) else 0,
-            )
-        return ties
+    def _tie(self, stamp: int, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> FrameTie:
+        keyframe = self._keyframes[stamp]
+        keypoints = keyframe.features.keypoints
+        inside = keypoints[:0] if own is None else keypoints[own >= 0]
+        size = keyframe.camera.width, keyframe.camera.height
+        return FrameTie(
+            stamp,
+            own is not None,
+            _hull(inside) / max(_hull(keypoints), 1e-9),
+            _cells(inside, size) / max(_cells(keypoints, size), 1),
+            len(inside),
+            len(keypoints),
+            _common(before, own),
+            _common(own, after),
+        )
+
+    def _model_of(self, stamp: int) -> SparseModel | None:
+        return next((model for model in self._models if stamp in model.stamps), None)
+
+    def _report(self, stamp: int) -> KeyframeReport:
+        model = self._model_of(stamp)
+        if model is None:
+            return KeyframeReport(stamp, False, "the global adjustment has refused its pose", 0, 0.0)
+        own = np.arange(*model.offsets[model.stamps.index(stamp) :][:2])
+        own = own[model.point_of[own] >= 0]
+        return KeyframeReport(stamp, True, "", len(own), float(model.errors(own).mean()) if len(own) else 0.0)
 
     def _register_anywhere(self, keyframe: _Keyframe) -> KeyframeReport:
+        """By the neighbours in time; failing that, by views that look alike."""
         report = KeyframeReport(keyframe.stamp, False, "no model has been started yet", 0, 0.0)
-        for model in sorted(self._models, key=lambda model: abs(_nearest(model, keyframe.stamp) - keyframe.stamp)):
-            report = self._register(model, keyframe)
+        for model in sorted(self._models, key=lambda model: _distance(model, keyframe.stamp))[:2]:
+            nearest = np.argsort(np.abs(np.array(model.stamps) - keyframe.stamp), kind="stable")[:2]
+            report = self._register(model, keyframe, nearest, COARSE)
             if report.registered:
-                break
+                return report
+        for model in sorted(self._models, key=len, reverse=True)[:2]:
+            alike = self._alike(model, keyframe)
+            if len(alike):
+                report = self._register(model, keyframe, alike, len(keyframe.features))
+            if report.registered:
+                return report
         return report
 
-    def _register(self, model: SparseModel, keyframe: _Keyframe) -> KeyframeReport:
-        """Pose from the map points that the neighbours in time see; then matches, tracks and local adjustment."""
-        order = np.argsort(np.abs(np.array(model.stamps) - keyframe.stamp), kind="stable")[:2]
-        features, others = [], []
-        for view in order:
-            other = self._keyframes[model.stamps[view]]
-            found = match(keyframe.features.descriptors[:COARSE], other.features.descriptors[:COARSE])
-            features.append(found[:, 0].astype(np.int64))
-            others.append(found[:, 1] + model.offsets[view])
-        feature, other_feature = np.concatenate(features), np.concatenate(others)
-        point = model.point_of[other_feature]
-        known = point >= 0
-        pairs = np.unique(np.stack([feature[known], point[known]], axis=1), axis=0)
-        pose = absolute_pose(
-            keyframe.features.keypoints[pairs[:, 0]], model.points[pairs[:, 1]], keyframe.camera, POSE_ERROR, self._seed
-        )
-        inliers = 0 if pose is None else int(pose.inliers.sum())
-        if pose is None or inliers < MIN_INLIERS:
-            reason = f"only {inliers} of {len(pairs)} matches with the map agree on a pose"
-            return KeyframeReport(keyframe.stamp, False, reason, inliers, 0.0)
-        view = model.add_view(keyframe.stamp, keyframe.rays, keyframe.focal, pose.camera_from_model)
-        used = pairs[pose.inliers]
+    def _alike(self, model: SparseModel, keyframe: _Keyframe) -> IntArray:
+        """Views, out of the few that it is the turn of, that share most of the strongest features."""
+        count = min(RETRIEVED, len(model))
+        views = (self._cursor + np.arange(count) * max(len(model) // RETRIEVED, 1)) % len(model)
+        self._cursor += 1
+        descriptors = keyframe.features.descriptors[:GLANCE]
+        found = [len(match(descriptors, self._features(model, int(view)).descriptors[:GLANCE])) for view in views]
+        order = np.argsort(-np.array(found), kind="stable")[:ALIKE]
+        return views[order][np.array(found)[order] > 0]
+
+    def _features(self, model: SparseModel, view: int) -> Features:
+        return self._keyframes[model.stamps[view]].features
+
+    def _locate(self, model: SparseModel, keyframe: _Keyframe, anchors: IntArray, count: int) -> _Location:
+        """Pose by the map points that the anchors see, from the `count` strongest features."""
+        evidence = {}
+        pairs = []
+        for view in anchors:
+            found = match(keyframe.features.descriptors[:count], self._features(model, view).descriptors[:count])
+            evidence[model.stamps[view]] = found
+            pairs.append(np.stack([found[:, 0], model.point_of[model.offsets[view] + found[:, 1]]], axis=1))
+        known = np.concatenate(pairs)
+        known = np.unique(known[known[:, 1] >= 0], axis=0)
+        pose = self._absolute_pose(model, keyframe, known)
+        if pose is None or pose.inliers.sum() < MIN_INLIERS:
+            agreeing = 0 if pose is None else int(pose.inliers.sum())
+            return _Location(None, known[:0], evidence, f"only {agreeing} of {len(known)} matches agree on a pose")
+        rest = known[~pose.inliers]
+        if len(rest) >= RIVAL * pose.inliers.sum():
+            rival = self._absolute_pose(model, keyframe, rest)
+            if rival is not None and rival.inliers.sum() >= RIVAL * pose.inliers.sum():
+                reason = f"{pose.inliers.sum()} matches agree on a pose and {rival.inliers.sum()} on another one"
+                return _Location(None, known[:0], evidence, reason)
+        return _Location(pose.camera_from_model, known[pose.inliers], evidence, "")
+
+    def _absolute_pose(self, model: SparseModel, keyframe: _Keyframe, pairs: IntArray) -> AbsolutePose | None:
+        pixels, points = keyframe.features.keypoints[pairs[:, 0]], model.points[pairs[:, 1]]
+        return absolute_pose(pixels, points, keyframe.camera, POSE_ERROR, self._seed)
+
+    def _register(self, model: SparseModel, keyframe: _Keyframe, anchors: IntArray, count: int) -> KeyframeReport:
+        """Pose, then matches, tracks and local adjustment; taken back when the result is thin or contradictory."""
+        location = self._locate(model, keyframe, anchors, count)
+        used = location.pairs
+        if location.camera_from_model is None:
+            return KeyframeReport(keyframe.stamp, False, location.reason, 0, 0.0)
+        view = model.add_view(keyframe.stamp, keyframe.rays, keyframe.focal, location.camera_from_model)
         first = np.unique(used[:, 0], return_index=True)[1]
         model.point_of[model.offsets[view] + used[first, 0]] = used[first, 1]
         self._link(model, view)
         self._adjust_locally(model, view)
-        if len(model) >= GROWTH * self._adjusted.get(id(model), 2):
+        self._evidence[keyframe.stamp] = location.evidence
+        objection = self._objection(model, view)
+        if objection:
+            self._drop(model, view)
+            return KeyframeReport(keyframe.stamp, False, objection, len(used), 0.0)
+        if len(model) >= GROWTH * model.adjusted_at:
             self._adjust_globally(model)
-        return self._registered(model, view)
+        return KeyframeReport(keyframe.stamp, True, "", len(used), 0.0)
 
-    def _registered(self, model: SparseModel, view: int) -> KeyframeReport:
-        own = np.arange(model.offsets[view], model.offsets[view + 1])
-        own = own[model.point_of[own] >= 0]
-        error = float(model.errors(own).mean()) if len(own) else 0.0
-        return KeyframeReport(model.stamps[view], True, "", len(own), error)
+    def _objection(self, model: SparseModel, view: int) -> str:
+        """Why a pose cannot be believed: too few points, or matches with the neighbours that contradict it."""
+        tied = int((model.point_of[model.features(view)] >= 0).sum())
+        if tied < MIN_INLIERS:
+            return f"only {tied} points hold its pose"
+        errors = [
+            model.epipolar_errors(view, model.stamps.index(other), found)
+            for other, found in self._evidence.get(model.stamps[view], {}).items()
+            if other in model.stamps
+        ]
+        error = np.concatenate(errors) if errors else np.empty(0)
+        share = float((error < POSE_ERROR).mean()) if len(error) else 1.0
+        if share < MIN_SHARE:
+            return f"only {share:.0%} of the matches with its neighbours agree with its pose"
+        return ""
+
+    def _drop(self, model: SparseModel, view: int) -> None:
+        del self._evidence[model.stamps[view]]
+        model.drop(view)
 
     def _link(self, model: SparseModel, view: int) -> None:
-        """Matches a view with its neighbours in time and with those that look at the same place, guided by the poses."""
+        """Matches a view with its neighbours in time and with those that look at the same place, by the poses."""
         own = model.point_of[model.features(view)]
         depth = model.points[own[own >= 0]] @ model.rotation[view, 2] + model.translation[view, 2]
         depth = depth[depth > 0]
@@ -289,7 +362,7 @@ class Mapper:
             return
         feature, other_feature = np.concatenate(features).astype(np.int64), np.concatenate(others).astype(np.int64)
         order = np.lexsort((other_feature, feature))
-        model.link(view, feature[order], other_feature[order])
+        model.link(feature[order], other_feature[order])
 
     def _partners(self, model: SparseModel, view: int, seen: IntArray) -> list[int]:
         """Neighbours in time, then the views into which most of the view's points project from a like direction."""
@@ -363,18 +436,18 @@ class Mapper:
         model = SparseModel()
         model.add_view(first.stamp, first.rays, first.focal, np.eye(4))
         view = model.add_view(second.stamp, second.rays, second.focal, pose.b_from_a)
-        found = found[pose.inliers].astype(np.int64)
-        found = found[np.argsort(found[:, 1], kind="stable")]
-        model.link(view, found[:, 1] + model.offsets[1], found[:, 0])
+        pairs = found[pose.inliers].astype(np.int64)
+        pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+        model.link(pairs[:, 1] + model.offsets[view], pairs[:, 0])
         model.adjust(None, 20, 1e-4)
         self._link(model, view)
         model.adjust(None, 20, 1e-4)
-        ids, start, features = model.observations(np.ones(len(model.points), bool))
+        ids, _, _ = model.observations(np.ones(len(model.points), bool))
         if len(ids) < START_POINTS:
             return None
         rays = model.points[ids, None] - model.centres()[None]
-        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-        angle = np.median(np.arccos(np.clip((rays[:, 0] * rays[:, 1]).sum(axis=1), -1, 1)))
+        cosine = (rays[:, 0] * rays[:, 1]).sum(axis=1) / np.linalg.norm(rays, axis=2).prod(axis=1)
+        angle = np.median(np.arccos(np.clip(cosine, -1, 1)))
         return model if angle > START_ANGLE else None
 
     def _retry(self, stamp: int) -> None:
@@ -382,6 +455,54 @@ class Mapper:
         for waiting in sorted(self._waiting, key=lambda other: abs(other - stamp))[:RETRIES]:
             if self._register_anywhere(self._keyframes[waiting]).registered:
                 self._waiting.remove(waiting)
+
+    def _merge(self, stamp: int) -> None:
+        """Joins the keyframe's model with another one in which the keyframe can be located as well."""
+        own = self._model_of(stamp)
+        if own is None:
+            return
+        keyframe = self._keyframes[stamp]
+        for other in [model for model in self._models if model is not own]:
+            alike = self._alike(other, keyframe)
+            if not len(alike):
+                continue
+            location = self._locate(other, keyframe, alike, len(keyframe.features))
+            if location.camera_from_model is None:
+                continue
+            view = own.stamps.index(stamp)
+            used = location.pairs
+            mine = own.point_of[own.offsets[view] + used[:, 0]]
+            used, mine = used[mine >= 0], mine[mine >= 0]
+            own_pose = own.pose(view)
+            depth = own.points[mine] @ own_pose[2, :3] + own_pose[2, 3]
+            pose = location.camera_from_model
+            ratio = (other.points[used[:, 1]] @ pose[2, :3] + pose[2, 3]) / depth
+            scale = float(np.median(ratio)) if len(ratio) else 0.0
+            if scale <= 0 or (np.abs(ratio / scale - 1) < DEPTH_TOLERANCE).sum() < MIN_INLIERS:
+                continue
+            own_pose[:3, 3] *= scale
+            other_from_own = np.linalg.inv(pose) @ own_pose
+            self._join(own, other, scale, other_from_own, stamp)
+            return
+
+    def _join(
+        self, source: SparseModel, target: SparseModel, scale: float, target_from_source: FloatArray, stamp: int
+    ) -> None:
+        if len(source) > len(target):
+            source, target = target, source
+            scale = 1 / scale
+            target_from_source = np.linalg.inv(target_from_source) @ np.eye(4)
+            target_from_source[:3, 3] *= scale
+        target.absorb(source, scale, target_from_source)
+        self._models = [model for model in self._models if model is not source]
+        # The seam is tight where the keyframe saw both, and is sewn up from there.
+        for view in sorted(range(len(target)), key=lambda view: abs(target.stamps[view] - stamp))[: 2 * LOCAL_WINDOW]:
+            self._link(target, view)
+        self._adjust_globally(target)
+        for other in source.stamps:
+            if other in target.stamps:
+                self._link(target, target.stamps.index(other))
+        self._adjust_globally(target)
 
     def _adjust_locally(self, model: SparseModel, view: int) -> None:
         shared = model.covisible(view)
@@ -393,21 +514,29 @@ class Mapper:
             model.adjust(window, 10, 1e-3)
 
     def _adjust_globally(self, model: SparseModel) -> None:
+        """Adjusts all views, and sends those back to wait whose poses turn out wrong."""
         model.adjust(None, 10, 1e-3)
-        self._adjusted[id(model)] = len(model)
-
-    def _complete(self, model: SparseModel) -> None:
-        """Looks again for matches now that the poses are better."""
-        for view in range(len(model)):
-            self._link(model, view)
+        for view in reversed(range(len(model))):
+            if len(model) > 2 and self._objection(model, view):
+                self._waiting.append(model.stamps[view])
+                self._drop(model, view)
+        model.adjusted_at = len(model)
 
 
 def _tracks(model: SparseModel) -> int:
     return int((model.point_of >= 0).sum())
 
 
-def _nearest(model: SparseModel, stamp: int) -> int:
-    return min(model.stamps, key=lambda other: abs(other - stamp))
+def _distance(model: SparseModel, stamp: int) -> int:
+    """Time to the model's nearest view, ns."""
+    return min(abs(other - stamp) for other in model.stamps)
+
+
+def _common(points: IntArray | None, others: IntArray | None) -> int:
+    """Points that two views both see."""
+    if points is None or others is None:
+        return 0
+    return len(np.intersect1d(points[points >= 0], others[others >= 0]))
 
 
 def _hull(pixels: NDArray[np.float32]) -> float:

@@ -96,7 +96,7 @@ def _search(descriptors_a, near, far, descriptors_b, keypoints_b, order, start, 
                         continue
                     dot = 0
                     for i in range(128):
-                        dot += np.int32(descriptors_a[a, i]) * np.int32(descriptors_b[b, i])
+                        dot += int(descriptors_a[a, i]) * int(descriptors_b[b, i])
                     if dot > best:
                         if best_b >= 0 and not _near(keypoints_b, b, best_b):
                             second = max(second, best)

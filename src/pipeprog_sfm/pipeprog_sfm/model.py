@@ -6,6 +6,8 @@ they already know (a loop found late, a frame tried again), and every look at th
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -27,20 +29,21 @@ class SparseModel:
     """Views (index, in order of registration) and points of one connected piece of map.
 
     `point_of` holds the point of each feature of all views in a row (NONE: no point); the features of view v are
-    offsets[v]:offsets[v + 1]. Points are never renumbered between calls of compact().
+    offsets[v]:offsets[v + 1].
     """
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.offsets: list[int] = [0]
-        self.rotation = np.empty((0, 3, 3))
-        self.translation = np.empty((0, 3))
-        self.focal = np.empty((0, 2))
-        self.points = np.empty((0, 3))
+        self.rotation: FloatArray = np.empty((0, 3, 3))
+        self.translation: FloatArray = np.empty((0, 3))
+        self.focal: FloatArray = np.empty((0, 2))
+        self.points: FloatArray = np.empty((0, 3))
         self.noise = NOISE_RANGE[1]
-        self._rays = np.empty((0, 2))
-        self._view_of = np.empty(0, np.int32)
-        self._point_of = np.empty(0, np.int64)
+        self.adjusted_at = 2  # views at the last global adjustment
+        self._rays: FloatArray = np.empty((0, 2))
+        self._view_of: NDArray[np.int32] = np.empty(0, np.int32)
+        self._point_of: IntArray = np.empty(0, np.int64)
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -91,8 +94,8 @@ class SparseModel:
         self.focal = np.concatenate([self.focal, focal[None]])
         return view
 
-    def link(self, view: int, features: IntArray, others: IntArray) -> None:
-        """Turns matches of a view's features with features of other views (flat indices) into tracks.
+    def link(self, features: IntArray, others: IntArray) -> None:
+        """Turns matches of one view's features with features of other views (flat indices) into tracks.
 
         A feature joins the point of its match when the point reprojects onto it; two points seen as one are merged;
         matches without a point are triangulated. `features` must be sorted.
@@ -110,6 +113,43 @@ class SparseModel:
             self.rotation, self.translation, self.focal, MAX_ERROR, np.cos(MIN_ANGLE),
         )  # fmt: skip
         self.points = np.concatenate([self.points, created])
+
+    def drop(self, view: int) -> None:
+        """Takes a view out; later views move up by one."""
+        own = self.features(view)
+        size = own.stop - own.start
+        for array in (self._rays, self._view_of, self._point_of):
+            array[own.start : self.offsets[-1] - size] = array[own.stop : self.offsets[-1]].copy()
+        self._view_of[own.start : self.offsets[-1] - size] -= 1
+        del self.stamps[view]
+        self.offsets = self.offsets[: view + 1] + [offset - size for offset in self.offsets[view + 2 :]]
+        self.rotation = np.delete(self.rotation, view, axis=0)
+        self.translation = np.delete(self.translation, view, axis=0)
+        self.focal = np.delete(self.focal, view, axis=0)
+
+    def absorb(self, other: SparseModel, scale: float, self_from_other: FloatArray) -> None:
+        """Takes over the views and points of another model; self_from_other (4, 4) rigid, applied after the scale."""
+        first_point = len(self.points)
+        rotation, translation = self_from_other[:3, :3], self_from_other[:3, 3]
+        self.points = np.concatenate([self.points, scale * other.points @ rotation.T + translation])
+        for view, stamp in enumerate(other.stamps):
+            pose = other.pose(view)
+            pose[:3, 3] *= scale
+            own = other.features(view)
+            new = self.add_view(stamp, other.rays[own], other.focal[view], pose @ np.linalg.inv(self_from_other))
+            point = other.point_of[own]
+            self.point_of[self.features(new)] = np.where(point >= 0, point + first_point, NONE)
+
+    def epipolar_errors(self, view: int, other: int, matches: NDArray[np.int32]) -> FloatArray:
+        """Distances in px of the matched features of `other` from the epipolar lines of those of `view`; matches (M, 2)."""
+        rotation = self.rotation[other] @ self.rotation[view].T
+        tx, ty, tz = self.translation[other] - rotation @ self.translation[view]
+        essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ rotation
+        own = self.rays[self.offsets[view] + matches[:, 0]]
+        theirs = self.rays[self.offsets[other] + matches[:, 1]]
+        line = np.c_[own, np.ones(len(own))] @ essential.T
+        residual = (line * np.c_[theirs, np.ones(len(theirs))]).sum(axis=1)
+        return np.abs(residual) / np.maximum(np.hypot(*(line[:, :2] / self.focal[other]).T), 1e-12)
 
     def observations(self, points: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
         """Features that see the chosen points (mask over the points), sorted by point.
@@ -151,7 +191,8 @@ class SparseModel:
         used, view = np.unique(self.view_of[features], return_inverse=True)
         result = adjust(
             self.rotation[used], self.translation[used], free[used], self.points[ids], start, view.astype(np.int64),
-            self.rays[features], self.focal[used], loss_scale=CAUCHY * self.noise, max_iterations=max_iterations, tolerance=tolerance,
+            self.rays[features], self.focal[used], loss_scale=CAUCHY * self.noise,
+            max_iterations=max_iterations, tolerance=tolerance,
         )  # fmt: skip
         self.rotation[used], self.translation[used] = result.rotation, result.translation
         self.points[ids] = result.points
@@ -176,7 +217,7 @@ class SparseModel:
         return np.linalg.norm(difference * self.focal[view], axis=1)
 
 
-def _grown(array: NDArray, capacity: int) -> NDArray:
+def _grown(array: NDArray[Any], capacity: int) -> NDArray[Any]:
     grown = np.empty((capacity, *array.shape[1:]), array.dtype)
     grown[: len(array)] = array
     return grown
@@ -298,7 +339,7 @@ def _create(  # type: ignore[no-untyped-def]  # compiled
                         projector = (1.0 if i == j else 0.0) - directions[k, i] * directions[k, j]
                         normal[i, j] += projector
                         right[i] += projector * centres[k, j]
-            point = np.linalg.solve(normal, right)
+            point[:] = np.linalg.solve(normal, right)
             agreeing = 0
             for k in range(size):
                 view = view_of[track[k]]
