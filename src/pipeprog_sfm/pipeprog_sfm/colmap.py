@@ -71,14 +71,7 @@ def absolute_pose(
     return AbsolutePose(_matrix(result["cam_from_world"]), np.asarray(result["inlier_mask"], bool))
 
 
-def similarity(source: FloatArray, target: FloatArray, max_error: float, seed: int) -> FloatArray | None:
-    """target_from_source (4, 4) of (M, 3) matched points by LO-RANSAC, max_error in the target's unit."""
-    ransac = pycolmap.RANSACOptions(max_error=max_error, random_seed=seed, min_num_trials=100, max_num_trials=2000)
-    result = pycolmap.estimate_sim3d_robust(source, target, ransac)
-    return None if result is None else _matrix(result)
-
-
-def _matrix(transform: pycolmap.Rigid3d | pycolmap.Sim3d) -> FloatArray:
+def _matrix(transform: pycolmap.Rigid3d) -> FloatArray:
     matrix = np.eye(4)
     matrix[:3] = transform.matrix()
     return matrix

@@ -141,7 +141,7 @@ class SparseModel:
             self.point_of[self.features(new)] = np.where(point >= 0, point + first_point, NONE)
 
     def epipolar_errors(self, view: int, other: int, matches: NDArray[np.int32]) -> FloatArray:
-        """Distances in px of the matched features of `other` from the epipolar lines of those of `view`; matches (M, 2)."""
+        """Distances in px of the features of `other` from the epipolar lines of those of `view`; matches (M, 2)."""
         rotation = self.rotation[other] @ self.rotation[view].T
         tx, ty, tz = self.translation[other] - rotation @ self.translation[view]
         essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ rotation

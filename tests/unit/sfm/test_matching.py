@@ -30,7 +30,7 @@ def test_match_finds_a_permutation() -> None:
 def test_match_refuses_strangers_and_twins() -> None:
     looks = descriptors(0)
     assert len(match(root_sift(looks), root_sift(descriptors(9)))) == 0
-    assert len(match(noisy(looks, 2), noisy(np.concatenate([looks, looks]), 3))) == 0
+    assert len(match(noisy(looks, 2), root_sift(np.concatenate([looks, looks])))) == 0
 
 
 def test_match_of_nothing_is_empty() -> None:
@@ -46,9 +46,9 @@ def test_guided_match_tells_twins_apart_by_place() -> None:
     rng = np.random.default_rng(4)
     looks = descriptors(0)
     places = rng.uniform([0, 0], [1000, 700], (COUNT, 2))
-    twins = places + [300, 0]
-    near = places + [-20, 1]
-    far = places + [20, 1]
+    twins = places + np.array([300, 0])
+    near = places + np.array([-20, 1])
+    far = places + np.array([20, 1])
     found = match_guided(
         noisy(looks, 2),
         near,
