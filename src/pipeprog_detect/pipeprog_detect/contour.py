@@ -27,8 +27,9 @@ from pipeprog_detect.support import hits, support_profile
 CHUNK = 12
 # Scale of the robust loss [px] and of the unresolved error of one edge within a blur of its place [px].
 ROBUST, FLOOR = 0.3, 0.1
-# A tenth of the blur remains as the limb model's own error, common to all views [px].
-MODEL_ERROR = 0.05
+# A tenth of the blur remains as the limb model's own error, common to all views [px]; where the outline is not seen,
+# edges of texture take its place, spread evenly within the robust loss.
+MODEL_ERROR, CLUTTER_ERROR = 0.05, ROBUST / np.sqrt(3.0)
 # Where the vote cannot tell, so many candidates compete on sub-pixel edges.
 CANDIDATES = 3
 # Edges count within so many pixels of the vote's and of the refined outlines.
@@ -179,7 +180,8 @@ def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far
     the precision [1/m^2] of the start, from which `so_far` (5,) has led: where the views lie in a row along the pipe,
     only the cloud knows its distance.
 
-    The covariance clusters the residuals by view (sandwich estimator): edges along one line share their errors.
+    The covariance clusters the residuals by view and by place (sandwich estimator): edges along one line share the
+    error of its pose, edges at one place that of its texture.
     """
     jacobian = at.jacobian
     sign = sideways(at)
@@ -208,12 +210,23 @@ def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far
         if active.any():
             variance = max(float(np.mean(offset[active] ** 2 + 1.0 / own[active])), 0.02**2)
     remaining = np.where(used, seen - jacobian @ step - sign * offset[at.view], 0.0)
-    scores = np.stack([np.bincount(at.view, weighted[:, k] * remaining, count) for k in range(5)], axis=1)
-    clusters = len(np.unique(at.view[used]))
     inverse = np.linalg.inv(normal)
-    covariance = inverse @ (scores.T @ scores) @ inverse * clusters / max(clusters - 3, 1) + inverse
-    covariance = covariance + (MODEL_ERROR / float(np.median(at.gain))) ** 2 * np.eye(5)
-    return _Solution(step, covariance, offset, used)
+    freed = weighted - (weight * sign)[:, None] * (cross / own[:, None])[at.view]
+    spread = _clustered(weighted * remaining[:, None], at.view, used)
+    spread = spread + _clustered(freed * remaining[:, None], _places(at), used)
+    return _Solution(step, inverse @ spread @ inverse + inverse, offset, used)
+
+
+def _places(at: Stations) -> NDArray[np.int64]:
+    """Index (N,) of each station's position along the axis: texture there is the same in all views."""
+    return np.unique(np.round(at.along, 6), return_inverse=True)[1].astype(np.int64)
+
+
+def _clustered(scores: FloatArray, group: NDArray[np.int64], used: NDArray[np.bool_]) -> FloatArray:
+    """Sum (5, 5) of the outer products of the scores (N, 5) of each group, corrected for few groups."""
+    total = np.stack([np.bincount(group, scores[:, k]) for k in range(5)], axis=1)
+    groups = len(np.unique(group[used]))
+    return total.T @ total * groups / max(groups - 3, 1)
 
 
 def _moved_by(edges: LimbEdges, at: Stations, solution: _Solution) -> LimbEdges:
@@ -235,7 +248,8 @@ def _result(
     from_ends[2:4, 0:2] = -np.eye(2) / length
     from_ends[2:4, 2:4] = np.eye(2) / length
     from_ends[4, 4] = 1.0
-    covariance = from_ends @ solution.covariance @ from_ends.T
+    systematic = np.hypot(MODEL_ERROR, CLUTTER_ERROR * (1.0 - share)) / float(np.median(at.gain))
+    covariance = from_ends @ (solution.covariance + systematic**2 * np.eye(5)) @ from_ends.T
     start, end = ends
     measured = Cylinder(
         cylinder.start - (start.position if start else 0.0) * axis,

@@ -75,11 +75,12 @@ class LimbEdges:
 
 
 def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
-    """Model (Q, 5) at outward distances x (Q,) px from a limb of apparent radius `half_width`, blurred by `blur` px.
+    """Model (Q, 5 or 6) at outward distances x (Q,) px from a limb of apparent radius `half_width`, blurred by `blur`.
 
     Outside: a level and a slope; inside: a level, and the two components of a cylinder's normal, of which the one
     towards the viewer rises as the square root of the depth (Lambert shading of a circular section). At grazing
     incidence the surface reflects what lies just behind it (Fresnel, in Schlick's form): there the outside shows.
+    On a thin pipe the window reaches across the highlight: one more even term bends the shading.
     """
     grid, columns = _limb_table(half_width, blur, float(np.ceil(np.abs(x).max())))
     return np.stack([np.interp(x, grid, column) for column in columns], axis=1)
@@ -87,21 +88,29 @@ def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def _limb_table(half_width: float, blur: float, extent: float) -> tuple[FloatArray, FloatArray]:
-    """Distances (G,) within +-`extent` and the model's blurred columns (5, G) there."""
+    """Distances (G,) within +-`extent` and the model's blurred columns (5 or 6, G) there."""
     fine = 0.05
     reach = int(np.ceil(4.0 * blur / fine))
     count = round(extent / fine) + reach
     grid = np.arange(-count, count + 1) * fine
     inside = np.clip(0.5 - grid / fine, 0.0, 1.0)
-    depth = np.clip(-grid, 0.0, half_width) / half_width
-    towards = np.sqrt(depth * (2.0 - depth))
+    depth = np.maximum(-grid / half_width, 0.0)
+    near = np.minimum(depth, 1.0)
+    towards = np.sqrt(near * (2.0 - near))
     mirrored = RIM * (1.0 - towards) ** 5 * inside
     body = inside - mirrored
-    columns = [1.0 - body, (1.0 - inside) * grid / 4.0, body, body * depth * half_width / 4.0, body * towards]
+    columns = [1.0 - body, (1.0 - inside) * grid / 4.0, body, body * near * half_width / 4.0, body * towards]
+    if _is_thin(half_width):
+        columns.append(body * depth**2)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * fine / blur) ** 2)
     kernel /= kernel.sum()
-    blurred = np.stack([np.convolve(column, kernel, mode="valid") for column in columns])
-    return grid[reach : len(grid) - reach], blurred
+    blurred: FloatArray = np.stack([np.convolve(column, kernel, mode="valid") for column in columns])
+    return np.asarray(grid[reach : len(grid) - reach], float), blurred
+
+
+def _is_thin(half_width: float) -> bool:
+    """Whether the limb model's window spans the pipe's half."""
+    return half_width * WINDOW_OF_HALF_WIDTH < INWARD
 
 
 def _costs(
@@ -109,7 +118,7 @@ def _costs(
 ) -> FloatArray:
     """What `limb_basis` at each trial position leaves of the values' squares (N, T).
 
-    The five levels follow by linear least squares (variable projection). Widths are grouped by 15 %, which moves the
+    The model's levels follow by linear least squares (variable projection). Widths are grouped by 15 %, which moves the
     limb's shape by less than the noise.
     """
     cost = np.empty((len(values), len(trials)))
@@ -125,9 +134,10 @@ def _costs(
     return np.maximum(cost, 0.0)
 
 
-def _smooth_cost(values: FloatArray, offsets: FloatArray) -> FloatArray:
+def _smooth_cost(values: FloatArray, offsets: FloatArray, half_width: FloatArray) -> FloatArray:
     """What a polynomial with as many coefficients as the limb model leaves (N,)."""
-    smooth = np.linalg.qr(np.vander(offsets / np.abs(offsets).max(), 5))[0]
+    order = 6 if len(values) and _is_thin(float(np.median(half_width))) else 5
+    smooth = np.linalg.qr(np.vander(offsets / np.abs(offsets).max(), order))[0]
     part = values @ smooth
     return np.maximum(np.einsum("ij,ij->i", values, values) - np.einsum("ij,ij->i", part, part), 1e-9)
 
@@ -145,10 +155,10 @@ def limb_edges(
 
     Local minima over the position of what the limb model leaves unexplained.
     """
-    values = np.asarray(values, float)
+    light: FloatArray = np.asarray(values, np.float64)
     trials = np.arange(-reach, reach + 0.5 * step, step, dtype=float)
-    cost = _costs(values, offsets, half_width, blur, trials)
-    return _minima(cost, _smooth_cost(values, offsets), trials, places, len(offsets))
+    cost = _costs(light, offsets, half_width, blur, trials)
+    return _minima(cost, _smooth_cost(light, offsets, half_width), trials, places, len(offsets))
 
 
 def _minima(cost: FloatArray, plain: FloatArray, trials: FloatArray, places: int, samples: int) -> LimbEdges:
@@ -241,7 +251,7 @@ def estimate_blur(
         return SHARP
     trials = np.arange(-reach, reach + 0.1, 0.2, dtype=float)
     left = [_costs(values, offsets, at.half_width, float(blur), trials).min(axis=1) for blur in BLURS]
-    cost = np.log(np.stack(left) / _smooth_cost(values, offsets) + 1e-4)
+    cost = np.log(np.stack(left) / _smooth_cost(values, offsets, at.half_width) + 1e-4)
     clear = cost.min(axis=0) < np.log(0.4)
     outline = 2 * at.view + at.side
     best = []

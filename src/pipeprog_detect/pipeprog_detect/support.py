@@ -25,8 +25,8 @@ class SupportProfile:
     """Support by position: `along` (B,) from the cylinder's middle [m], and for each side (B, 2) views and hits."""
 
     along: FloatArray
-    seen: NDArray[np.floating]
-    hits: NDArray[np.floating]
+    seen: FloatArray
+    hits: FloatArray
 
     @property
     def share(self) -> float:
@@ -49,7 +49,7 @@ def support_profile(at: Stations, hit: NDArray[np.bool_]) -> SupportProfile:
     cell = 2 * place + at.side
     seen = np.bincount(cell, np.ones(len(cell)), 2 * len(along)).reshape(-1, 2)
     found = np.bincount(cell, hit.astype(float), 2 * len(along)).reshape(-1, 2)
-    return SupportProfile(along, seen, found)
+    return SupportProfile(along, np.asarray(seen, float), np.asarray(found, float))
 
 
 def support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], chunk: int = 12) -> float:
