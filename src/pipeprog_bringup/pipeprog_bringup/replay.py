@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import shutil
 import tempfile
 import time
@@ -173,6 +174,7 @@ class _Run:
         self._stage = ""
         self._status = msg.SfmStatus()
         self._heard: dict[str, float] = {}
+        self._latest: dict[type, Any] = {}
 
     def through(self, graph: Graph, recording: BagWriter) -> tuple[_Survey, msg.SfmStatus]:
         """Play every frame, let each node finish, and collect the last messages."""
@@ -197,8 +199,10 @@ class _Run:
                 revision = self._finish("sfm", keyframes)
             if not revision:
                 raise InputError(self._status.message or "nothing was reconstructed: no map came from sfm")
+            self._receive(PointCloud2, PathMsg)
             with self._timed("detect", "detecting pipes"):
                 self._finish("detect", revision)
+            self._receive(msg.PipeArray, MarkerArray)
             with self._timed("collect", "collecting the results"):
                 return self._collect(revision), self._status
         finally:
@@ -282,11 +286,15 @@ class _Run:
             raise InputError(f"{response.message or f'{name} found nothing to work on'}{reasons}")
         return response.outputs
 
+    def _receive(self, *kinds: type) -> None:
+        """Take the last message of topics that are complete: who subscribes now gets exactly that (transient local)."""
+        for kind in kinds:
+            keep = functools.partial(self._latest.__setitem__, kind)
+            self._node.create_subscription(kind, _LATCHED[kind], keep, qos.latched())
+
     def _collect(self, revision: int) -> _Survey:
-        """The last message of each topic: subscribing now, one gets exactly that (transient local, depth 1)."""
-        latest: dict[type, Any] = {}
-        for kind, topic in _LATCHED.items():
-            self._node.create_subscription(kind, topic, lambda m, kind=kind: latest.__setitem__(kind, m), qos.latched())
+        """Wait until the last messages are all of one map."""
+        latest = self._latest
 
         def complete() -> bool:
             if len(latest) < len(_LATCHED) or self._status.map_revision < revision:
