@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_detect.octree import Cells, IntArray, Octree
+from pipeprog_detect.octree import Cells, IntArray, Octree, decode, encode
 from pipeprog_detect.pipe import FloatArray
 
 # Real walls, and walls in real clouds, are flat to a millimetre over a few decimetres, no better.
@@ -59,7 +59,7 @@ def _on_region(
     tree: Octree, cells: Cells, plane: Plane, members: IntArray, neighbours: IntArray, mean: FloatArray, band: float
 ) -> NDArray[np.bool_]:
     """Points within `band` of the locally smoothed region (walls are wavy) in its cells and the cells around."""
-    offset = np.full(len(mean), np.nan)
+    offset: FloatArray = np.full(len(mean), np.nan)
     offset[members] = mean[members] @ plane.normal - plane.offset
     # The offset of a cell outside is the mean of its neighbours inside, twice over.
     for _ in range(2):
@@ -103,15 +103,13 @@ def _cell_planes(
 
 def _cell_neighbours(cells: Cells) -> IntArray:
     """Rows (M, 26) of the occupied cells around each cell, -1 where there is none."""
-    from pipeprog_detect.octree import _decode, _encode
-
-    grid = _decode(cells.keys)
+    grid = decode(cells.keys)
     out = np.full((len(cells.keys), 26), -1, np.int64)
     steps = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) != (0, 0, 0)]
     for column, step in enumerate(steps):
         other = grid + step
         inside = (other >= 0).all(axis=1)
-        keys = _encode(np.maximum(other, 0))
+        keys = encode(np.maximum(other, 0))
         at = np.minimum(np.searchsorted(cells.keys, keys), len(cells.keys) - 1)
         out[:, column] = np.where(inside & (cells.keys[at] == keys), at, -1)
     return out

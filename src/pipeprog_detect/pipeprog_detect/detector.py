@@ -22,6 +22,8 @@ from pipeprog_detect.verify import Candidate, measure, own_points, settle, thin_
 # comes last, when little is left for its many sites.
 _SCALES = (0.028, 0.04, 0.056, 0.08, 0.113, 0.16, 0.02)
 _POINTS_PER_SCALE = 7.0
+# Stereo is rougher on pipes, curved and glossy, than on the walls that the noise is read from.
+_STEREO_ON_PIPES = 2.0
 # Candidates that the images judge may be so many times as rough as pipes that the cloud alone must vouch for.
 _PROPOSED = 2.0
 # Pipes up to this radius [m] are sought as lines of points, in neighbourhoods several times as wide.
@@ -63,7 +65,8 @@ def detect(
     planned_radii = [planned.outer_radius for planned in bill.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
     jury = Jury(local_views if config.contour.enabled else [], bill, config.contour)
-    candidates = find_candidates(tree, sigma, (config.radius_min, widest), planned_radii, config, jury, report)
+    noise = _STEREO_ON_PIPES * sigma if jury.sits else sigma
+    candidates = find_candidates(tree, noise, (config.radius_min, widest), planned_radii, config, jury, report)
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(candidate, sigma, config) for candidate in candidates])
     pipes = [_pipe(each, bill, shift) for each in measured]
@@ -82,7 +85,7 @@ def find_candidates(
 ) -> list[Candidate]:
     """Accepted cylinders of the tree's points, none sharing points with another.
 
-    Clouds of stereo are rougher on pipes than on walls: what is too rough for the cloud alone is put to the images.
+    What is too rough for the cloud alone is put to the images, where there are any.
     """
     free = np.ones(len(tree.points), bool)
     accepted: list[Candidate] = []
@@ -114,15 +117,24 @@ def find_candidates(
     for line, _ in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
         consider(thin_start(tree, free, line, 1.2 * sigma, thin))
     report(0.8, "measuring")
-    return _settled(tree, accepted, sigma, config)
+    # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate.
+    return [
+        candidate
+        for candidate in _settled(tree, accepted, sigma, config, jury)
+        if jury.sits
+        or not candidate.blurred
+        or any(abs(candidate.cylinder.radius - radius) < 3.0 * candidate.radius_sigma for radius in planned_radii)
+    ]
 
 
-def _settled(tree: Octree, accepted: list[Candidate], sigma: float, config: DetectConfig) -> list[Candidate]:
+def _settled(
+    tree: Octree, accepted: list[Candidate], sigma: float, config: DetectConfig, jury: Jury
+) -> list[Candidate]:
     """Pieces of one pipe joined, then each measured on what lies nearest to it, elbows and the unfounded left out.
 
     The pipe found first had its neighbour's points as well: once both are known they are told apart.
     """
-    for _ in range(2):
+    for turn in range(2):
         joined = join([candidate.cylinder for candidate in accepted])
         settled = []
         for pieces in joined:
@@ -136,9 +148,11 @@ def _settled(tree: Octree, accepted: list[Candidate], sigma: float, config: Dete
             points = own_points(
                 tree.points[rows], cylinder, [other for other in others if near(other, cylinder, reach)]
             )
-            candidate = settle(points, cylinder, band, np.inf)
+            candidate = settle(points, cylinder, band, whole=turn > 0 or len(pieces) > 1)
             if candidate is not None and is_pipe(candidate, sigma, config, _PROPOSED):
                 settled.append(candidate)
+            elif jury.sits:  # the images will measure it
+                settled.append(replace(accepted[best], cylinder=cylinder))
         accepted = settled
     bends = elbows([candidate.cylinder for candidate in accepted])
     return [candidate for number, candidate in enumerate(accepted) if number not in bends]
@@ -148,7 +162,7 @@ def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig, roughness:
     """Whether the evidence makes a pipe of a cylinder whose surface may be `roughness` times as rough as usual."""
     evidence, cylinder = candidate.evidence, candidate.cylinder
     # The smaller the arc, the more surfaces that are no pipe fit it: its length has to make up for that.
-    slender = 3.0 if evidence.arc > np.radians(90.0) else 6.0
+    slender = 3.0 if evidence.arc > np.radians(80.0) else 6.0
     return (
         cylinder.length >= max(slender * cylinder.radius, config.length_min)
         and evidence.arc >= np.radians(config.arc_min_deg)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_detect.fit import basis
+from pipeprog_detect.octree import IntArray
 from pipeprog_detect.pipe import Cylinder, FloatArray
 
 _SECTORS = 36
@@ -95,24 +97,56 @@ def straight_stretch(points: FloatArray, cylinder: Cylinder, sigma: float) -> Ru
     if len(known) < 4:
         return Run(low, low + length)
     allowed = 2.5 * error + _WAVINESS + 0.02 * cylinder.radius
-    centre = low + (np.arange(slices) + 0.5) * size
+    centre = np.asarray(low + (np.arange(slices) + 0.5) * size, np.float64)
     line = _best_line(centre[known], shift[known], allowed[known], max(slices // 6, 1) * size)
     if not line.any():
         return None
     members = known[line]
-    # The stretch may bridge slices without points or with an obstacle, not a run of slices that disagree.
-    holes = np.flatnonzero(
-        [np.isin(np.arange(a + 1, b), known).sum() > 2 for a, b in zip(members, members[1:], strict=False)]
-    )
-    parts = np.split(members, holes + 1)
+    parts = _parts(members, known)
     longest = max(parts, key=len)
-    slope, origin = _fit_line(centre[longest], shift[longest], 1.0 / error[longest])
-    bent = np.linalg.norm(shift - origin - centre[:, None] * slope, axis=1) / error
-    deviation = bent * error
+    slope, origin = _fit_line(centre[longest], shift[longest], np.asarray(1.0 / error[longest]))
+    off = np.linalg.norm(shift - origin - centre[:, None] * slope, axis=1)
+    deviation: FloatArray = np.where(off > 2.5 * error + 0.5 * _WAVINESS, off, np.nan)
+    edges = low + longest[0] * size, low + (longest[-1] + 1) * size
     return Run(
-        _onset(low + longest[0] * size, -1, int(longest[0]), centre, deviation, bent, size),
-        _onset(low + (longest[-1] + 1) * size, 1, int(longest[-1]), centre, deviation, bent, size),
+        _onset(edges[0], centre[: longest[0]][::-1], deviation[: longest[0]][::-1], cylinder.radius),
+        _onset(edges[1], centre[longest[-1] + 1 :], deviation[longest[-1] + 1 :], cylinder.radius),
     )
+
+
+def _parts(members: IntArray, known: IntArray) -> list[IntArray]:
+    """The slices `members` parted where known slices between them disagree; a tee's few are bridged."""
+    parts: list[IntArray] = [members[:1]]
+    for last, following in pairwise(members):
+        between = int(((known > last) & (known < following)).sum())
+        if between:
+            parts.append(np.array([following]))
+        else:
+            parts[-1] = np.append(parts[-1], following)
+    bridged = [parts[0]]
+    for part in parts[1:]:
+        hole = int(((known > bridged[-1][-1]) & (known < part[0])).sum())
+        if hole <= 3 and min(len(bridged[-1]), len(part)) > 2 * hole + 1:
+            bridged[-1] = np.append(bridged[-1], part)
+        else:
+            bridged.append(part)
+    return bridged
+
+
+def _onset(end: float, centre: FloatArray, deviation: FloatArray, radius: float) -> float:
+    """Where the barrel ends before an elbow, given slices (S,) from the last straight one's edge `end` [m] outwards.
+
+    A long-radius elbow turns about 1.5 diameters, so at s beyond its beginning the section is s^2 / (6 r) off the
+    line: the first clearly bent slice tells where it began. Without a bend next to it the end stands.
+    """
+    near = slice(0, 2)
+    if not np.isfinite(deviation[near]).any():
+        return end
+    first = int(np.flatnonzero(np.isfinite(deviation[near]))[0])
+    back = np.sqrt(6.0 * radius * deviation[first])
+    outward = 1.0 if centre[first] > end else -1.0
+    onset = float(centre[first] - outward * back)
+    return min(onset, end) if outward > 0 else max(onset, end)
 
 
 def _fit_line(place: FloatArray, shift: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -122,30 +156,9 @@ def _fit_line(place: FloatArray, shift: FloatArray, weight: FloatArray) -> tuple
     return solved[0], solved[1]
 
 
-def _onset(
-    end: float, step: int, last: int, centre: FloatArray, deviation: FloatArray, bent: FloatArray, size: float
-) -> float:
-    """Where an elbow begins: beyond it the section leaves the line by s^2 / (2 R), so its root grows evenly.
-
-    `last` is the outermost slice that agrees with the line, `end` [m] its outer edge, `step` the way out. Slices
-    within it may be bent already, by less than the tolerance. Without a bend beyond, the end stands.
-    """
-    slices = last + step * np.arange(-2, 4)
-    slices = slices[(slices >= 0) & (slices < len(centre))]
-    slices = slices[np.nan_to_num(bent[slices]) > 3.0]
-    if len(slices) < 3:
-        return end
-    root = np.sqrt(deviation[slices])
-    slope, start = np.polyfit(centre[slices], root, 1)
-    if slope * step <= 0:
-        return end
-    onset = -start / slope
-    return float(min(max(onset, end - 4 * size), end) if step > 0 else max(min(onset, end + 4 * size), end))
-
-
 @njit(cache=True)
 def _best_line(place: FloatArray, shift: FloatArray, allowed: FloatArray, apart: float) -> NDArray[np.bool_]:
-    """Which slices agree with the line through two of them, at least `apart`, that most agree with, and most closely."""
+    """Slices that agree with the line through two of them, at least `apart`, that most agree with, and closely."""
     count = len(place)
     best = 0.0
     members = np.zeros(count, np.bool_)
@@ -176,7 +189,7 @@ def _slice_shifts(
     """Offset (S, 2) [m] of each slice's section and its standard deviation (S,), NaN where too few points are."""
 
     def total(values: FloatArray) -> FloatArray:
-        return np.bincount(place, weights=values, minlength=slices)
+        return np.asarray(np.bincount(place, weights=values, minlength=slices), np.float64)
 
     count = np.bincount(place, minlength=slices)
     cc, cs, ss = total(cosine * cosine), total(cosine * sine), total(sine * sine)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -16,6 +17,7 @@ _ANNEALING = 8
 _MOST_ROUNDS = 40
 _BLOCKS = 24
 _WINDOW = 6
+_SECTORS = 36
 # Mean slope of Tukey's psi at that cut under Gaussian noise: what a bias of the residual is worth in the equations.
 _SLOPE = 0.603
 _TENSOR_ROUNDS = 3
@@ -45,9 +47,9 @@ def basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors (3,) that complete the unit vector axis (3,) to a right-handed frame."""
     least = np.zeros(3)
     least[int(np.argmin(np.abs(axis)))] = 1.0
-    u = np.cross(axis, least)
+    u = np.asarray(np.cross(axis, least), np.float64)
     u /= np.linalg.norm(u)
-    return u, np.cross(axis, u)
+    return u, np.asarray(np.cross(axis, u), np.float64)
 
 
 def fit_cylinder(
@@ -67,8 +69,8 @@ def fit_cylinder(
     the known noise `sigma` [m], annealed from `reach` times the final width: with the scale of the residuals instead,
     a wall behind the pipe would count as noise and pull the radius up. Where normals (N, 3) are given, a point counts
     only as far as its normal is radial: outward where `signed` (normals towards the sensor), either way otherwise;
-    zero normals are not judged. The covariance is the sandwich over blocks along the axis, so noise that is alike in
-    neighbouring points is not taken for independent.
+    zero normals are not judged. The covariance is the sandwich over blocks along the axis and sectors
+    around it, so noise that is alike in neighbouring points is not taken for independent.
 
     Noise of cameras and scanners lies along the ray, so it moves a point across and along the surface together, and
     the plain geometric radius is too small by several noise variances over the radius. So the noise tensor of the
@@ -115,14 +117,14 @@ def fit_cylinder(
 def covered_arc(points: FloatArray, cylinder: Cylinder, bins: int = 72) -> float:
     """Widest stretch of the circumference [rad] that points (N, 3) on the cylinder cover, small gaps included.
 
-    A sector is covered above a tenth of what a full one holds; gaps up to 30 deg are closed, as a neighbour's shadow
-    makes them, so two surfaces that happen to touch one circle do not add up.
+    A sector is covered from three points and a thirtieth of what a full one holds; gaps up to 30 deg are closed, as
+    a neighbour's shadow makes them, so two surfaces that happen to touch one circle do not add up.
     """
     u, v = basis(cylinder.axis)
     offset = points - cylinder.start
     angle = np.arctan2(offset @ v, offset @ u)
     count = np.bincount(((angle + np.pi) * (bins / (2 * np.pi))).astype(int) % bins, minlength=bins)
-    seen = np.flatnonzero(count > 0.1 * np.sort(count)[-bins // 4 :].mean())
+    seen = np.flatnonzero((count > 2) & (count > 0.03 * np.sort(count)[-bins // 4 :].mean()))
     if not len(seen):
         return 0.0
     steps = np.diff(np.append(seen, seen[0] + bins))
@@ -209,14 +211,24 @@ def _sandwich(
         [np.bincount(block, weights=weight * residual * jacobian[:, k], minlength=_BLOCKS) for k in range(used)], axis=1
     )
     # Blocks near each other are wrong alike: Newey and West's window takes in their products.
-    meat = gradients.T @ gradients
+    meat: Any = gradients.T @ gradients
     for lag in range(1, _WINDOW):
         product = gradients[lag:].T @ gradients[:-lag]
         meat += (1.0 - lag / _WINDOW) * (product + product.T)
+    filled = max(int((np.abs(gradients).sum(axis=1) > 0).sum()), 2)
+    meat *= filled / (filled - 1)
+    # And what is wrong all along the pipe, a dent of the section, is seen over the sectors.
+    sector = ((np.arctan2(y, x) + np.pi) * (_SECTORS / (2 * np.pi))).astype(int) % _SECTORS
+    around = np.stack(
+        [np.bincount(sector, weights=weight * residual * jacobian[:, k], minlength=_SECTORS) for k in range(used)],
+        axis=1,
+    )
+    filled = int((np.abs(around).sum(axis=1) > 0).sum())
+    # The fit has made itself blind to as many patterns over the sectors as it has unknowns.
+    meat += around.T @ around * (filled / max(filled - used, 2))
     inverse = np.linalg.pinv(information)
     covariance = np.zeros((5, 5))
-    filled = max(int((np.abs(gradients).sum(axis=1) > 0).sum()), 2)
-    covariance[:used, :used] = inverse @ meat @ inverse * (filled / (filled - 1))
+    covariance[:used, :used] = inverse @ meat @ inverse
     return covariance
 
 

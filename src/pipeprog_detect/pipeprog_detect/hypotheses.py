@@ -81,7 +81,7 @@ def consensus(votes: Votes) -> list[tuple[Cylinder, int]]:
             continue
         centre, direction, radius = points[start], directions[start], float(radii[start])
         reach = 3.0 * votes.scale
-        members = np.zeros(0, np.int64)
+        members: IntArray = np.zeros(0, np.int64)
         for _ in range(10):
             members, along = _on_line(points, directions, radii, alive, centre, direction, radius, reach)
             members, along = _contiguous(members, along, max(0.3, 4.0 * votes.scale))
@@ -136,12 +136,12 @@ def _contiguous(members: IntArray, along: FloatArray, gap: float) -> tuple[IntAr
 def _agree(
     offset: FloatArray, direction: FloatArray, other: FloatArray, radius: float, other_radius: float
 ) -> tuple[bool, float]:
-    along = offset @ direction
+    along = float(offset @ direction)
     if abs(direction @ other) < _COSINE:
         return False, along
     if radius > _RATIO * other_radius or other_radius > _RATIO * radius:
         return False, along
-    lateral = offset @ offset - along * along
+    lateral = float(offset @ offset) - along * along
     return lateral < (_LATERAL * radius) ** 2, along
 
 

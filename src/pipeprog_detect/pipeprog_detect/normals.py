@@ -88,10 +88,10 @@ def estimate_noise(tree: Octree, most_cells: int = 20000) -> float:
             break
     else:
         return 0.0
-    chosen = full[:: max(1, len(full) // most_cells)]
+    chosen: IntArray = full[:: max(1, len(full) // most_cells)]
     residual = _patch_residuals(tree.points, cells.starts[chosen], cells.starts[chosen + 1], cells.size)
-    residual = residual[residual > 0]
-    return float(np.median(residual)) / _TUKEY_SHRINKAGE if len(residual) else 0.0
+    clean = residual[residual > 0]
+    return float(np.median(clean)) / _TUKEY_SHRINKAGE if len(clean) else 0.0
 
 
 @njit(cache=True)
@@ -126,7 +126,7 @@ def _solve_quadric(
     points: FloatArray, origin: FloatArray, frame: FloatArray, scale: float, sigma: float, rounds: int
 ) -> tuple[FloatArray, float, float, float]:
     """Weighted z = q . (1, x, y, xx, xy, yy) in units of scale; returns q, rms [m], inlier share, variance of xx."""
-    q = np.zeros(6)
+    q: FloatArray = np.zeros(6)
     rms, share, variance = 0.0, 0.0, 0.0
     row = np.empty(6)
     for turn in range(rounds):
@@ -161,7 +161,7 @@ def _solve_quadric(
             for b in range(a):
                 normal[a, b] = normal[b, a]
         inverse = np.linalg.inv(normal)
-        q = inverse @ right
+        q = np.dot(inverse, right)
         rms = scale * np.sqrt(square / max(weights, 1e-12))
         share = total / len(points)
         variance = max(inverse[3, 3], inverse[5, 5])
@@ -257,7 +257,7 @@ def _patch_residuals(points: FloatArray, first: IntArray, last: IntArray, scale:
         frame = np.empty((3, 3))
         frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
         wide = max(spread[0], 1e-6)
-        q, rms, share, variance = _solve_quadric(near, mean, frame, scale, wide, 3)
+        _, rms, share, _ = _solve_quadric(near, mean, frame, scale, wide, 3)
         if share > 0.8:
             out[c] = rms * np.sqrt(len(near) / max(len(near) - 6.0, 1.0))
     return out

@@ -61,7 +61,7 @@ class Octree:
 
     def centres(self, cells: Cells) -> FloatArray:
         """Centres of cells (M, 3) [m]."""
-        return self.origin + (_decode(cells.keys) + 0.5) * cells.size
+        return self.origin + (decode(cells.keys) + 0.5) * cells.size
 
     def subset(self, mask: NDArray[np.bool_]) -> Octree:
         """The tree of the points where mask (N,) is true."""
@@ -75,15 +75,12 @@ class Octree:
         means = np.add.reduceat(self.points, cells.starts[:-1], axis=0) / cells.counts[:, None]
         index = np.arange(len(means))
         # The mean lies in its cell; its own key keeps the order of the cells.
-        keys = _encode(_grid(means, self.origin, self.quantum))
+        keys = encode(_grid(means, self.origin, self.quantum))
         rank = np.argsort(keys, kind="stable")
         return Octree(means[rank], keys[rank], index[rank], self.origin, self.quantum)
 
     def near_segment(self, start: FloatArray, end: FloatArray, distance: float) -> IntArray:
-        """Rows, ascending, of the points within `distance` [m] of the segment start-end (3,), a cylinder with flat ends.
-
-        The ends are extended by nothing: a point beyond them is not returned.
-        """
+        """Rows, ascending, of the points in the cylinder of radius `distance` [m] with flat ends about a segment."""
         cells = self.cells(self.level_of(0.0625))
         centres = self.centres(cells)
         length = float(np.linalg.norm(end - start))
@@ -113,7 +110,7 @@ def build(points: FloatArray) -> Octree:
     quantum = _FINEST
     while extent / quantum >= 2**_BITS - 1:
         quantum *= 2.0
-    keys = _encode(_grid(points, origin, quantum))
+    keys = encode(_grid(points, origin, quantum))
     order = np.argsort(keys)
     keys = keys[order]
     same = keys[1:] == keys[:-1]
@@ -155,7 +152,8 @@ def _grid(points: FloatArray, origin: FloatArray, quantum: float) -> IntArray:
 
 
 @njit(cache=True)
-def _encode(grid: IntArray) -> IntArray:
+def encode(grid: IntArray) -> IntArray:
+    """Morton keys (N,) of cells (N, 3), 21 bits a coordinate."""
     keys = np.empty(len(grid), np.int64)
     for i in range(len(grid)):
         keys[i] = _spread(grid[i, 0]) << 2 | _spread(grid[i, 1]) << 1 | _spread(grid[i, 2])
@@ -163,7 +161,8 @@ def _encode(grid: IntArray) -> IntArray:
 
 
 @njit(cache=True)
-def _decode(keys: IntArray) -> IntArray:
+def decode(keys: IntArray) -> IntArray:
+    """Cells (N, 3) of Morton keys (N,)."""
     grid = np.empty((len(keys), 3), np.int64)
     for i in range(len(keys)):
         grid[i, 0] = _gather(keys[i] >> 2)

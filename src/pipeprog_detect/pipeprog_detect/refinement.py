@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.classify import classify
 from pipeprog_detect.config import ContourConfig
@@ -16,6 +18,10 @@ from pipeprog_detect.verify import Candidate
 CONVINCING = 0.5
 # The windows in which outlines are sought follow from the radius: where it changes by more, they are placed anew.
 SETTLED, MAX_ROUNDS = 0.1, 3
+# Views that suffice to tell a pipe from a shadow; to measure it all are used.
+FEW_VIEWS = 30
+# The cloud resolves a section of five times its noise, seen along a third of the way around.
+RESOLVED_RADII, RESOLVED_ARC = 5.0, np.radians(120.0)
 
 
 @dataclass(frozen=True)
@@ -32,22 +38,33 @@ class Jury:
 
     def __init__(self, views: Sequence[View], bill: Bill, config: ContourConfig) -> None:
         self._views, self._bill, self._config = views, bill, config
+        self._few = views[:: -(-len(views) // FEW_VIEWS)] if views else []
+        self._refused: list[Cylinder] = []
+
+    @property
+    def sits(self) -> bool:
+        """Whether there are keyframes to judge by."""
+        return bool(self._views)
 
     def vouches_for(self, candidate: Candidate) -> bool:
         """Whether the keyframes make a pipe of a candidate of which the cloud alone is not sure.
 
         They must show most of its outlines, and these must have a planned size: shadows have outlines, too.
         """
-        fit = self._refined(candidate, [])
-        if fit is None or fit.support < CONVINCING:
+        if any(_alike(candidate.cylinder, refused) for refused in self._refused):
             return False
-        return classify(fit.cylinder.radius, fit.radius_sigma, self._bill)[0] is not None
+        fit = self._refined(candidate, [], self._few)
+        if fit is None or fit.support < CONVINCING or not self._is_planned(fit):
+            self._refused.append(candidate.cylinder)
+            return False
+        return True
 
     def measure(self, candidates: Sequence[Candidate], trusted: Sequence[bool]) -> list[Measured]:
         """The candidates measured by their outlines.
 
-        A candidate without outlines stays as the cloud has it where the cloud alone vouches for it (`trusted`), else
-        it goes. Those with most points come first; what they turn out to be is known when the others are measured.
+        A candidate without outlines stays as the cloud has it only where the cloud vouches for it (`trusted`) and,
+        beside keyframes that should have shown it, resolves its section. Those with most points come first; what they
+        turn out to be is known when the others are measured.
         """
         order = sorted(range(len(candidates)), key=lambda number: -candidates[number].points)
         current = {number: candidates[number].cylinder for number in order if trusted[number]}
@@ -55,8 +72,10 @@ class Jury:
         for number in order:
             candidate = candidates[number]
             others = [cylinder for other, cylinder in current.items() if other != number]
-            fit = self._refined(candidate, others)
-            if fit is None and self._views and not trusted[number]:
+            fit = self._refined(candidate, others, self._views)
+            if fit is None and not (trusted[number] and (not self.sits or _resolved(candidate))):
+                continue
+            if fit is not None and not trusted[number] and not self._is_planned(fit):
                 continue
             measured = (
                 Measured(candidate, candidate.cylinder, candidate.radius_sigma)
@@ -69,15 +88,15 @@ class Jury:
                 found.append(measured)
         return found
 
-    def _refined(self, candidate: Candidate, others: Sequence[Cylinder]) -> ContourFit | None:
-        if not self._views:
+    def _refined(self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]) -> ContourFit | None:
+        if not views:
             return None
         planned_radii = [planned.outer_radius for planned in self._bill.classes]
         # The surface may lie as far from its points' mean as they scatter: the cloud's sigma knows of noise alone.
         sigma = max(candidate.radius_sigma, candidate.evidence.noise)
         cylinder = candidate.cylinder
         for _ in range(MAX_ROUNDS):
-            fit = refine(cylinder, sigma, self._views, others, self._config, planned_radii)
+            fit = refine(cylinder, sigma, views, others, self._config, planned_radii)
             if fit is None or abs(fit.cylinder.radius - cylinder.radius) < SETTLED * cylinder.radius:
                 break
             cylinder = fit.cylinder
@@ -88,3 +107,18 @@ def _contains(cylinder: Cylinder, point: FloatArray) -> bool:
     along = float((point - cylinder.start) @ cylinder.axis)
     off_axis = point - cylinder.start - along * cylinder.axis
     return 0.0 < along < cylinder.length and float(off_axis @ off_axis) < cylinder.radius**2
+
+
+def _alike(one: Cylinder, other: Cylinder) -> bool:
+    """Whether two candidates would be judged alike: the same place and size but for a tenth of the radius."""
+    tolerance = 0.1 * other.radius
+    if abs(one.radius - other.radius) > tolerance:
+        return False
+    same = max(np.linalg.norm(one.start - other.start), np.linalg.norm(one.end - other.end))
+    turned = max(np.linalg.norm(one.start - other.end), np.linalg.norm(one.end - other.start))
+    return bool(min(same, turned) < max(tolerance, 0.1 * other.length))
+
+
+def _resolved(candidate: Candidate) -> bool:
+    evidence = candidate.evidence
+    return candidate.cylinder.radius > RESOLVED_RADII * evidence.noise and evidence.arc > RESOLVED_ARC

@@ -8,12 +8,12 @@ import numpy as np
 
 from pipeprog_detect.pipe import Cylinder, FloatArray
 
-# Pieces of one pipe: axes within this angle, offset by this share of the radius (and what a short piece's axis may be
+# Pieces of one pipe: axes within this angle, offset by this share of the radius (and what waviness may add
 # off), radii within this ratio.
 _ANGLE = np.radians(2.0)
 _OFFSET = 0.25
 _RATIO = 1.12
-_LEAST_OFFSET = 2e-3
+_LEAST_OFFSET = 4e-3
 
 
 def near(one: Cylinder, other: Cylinder, reach: float) -> bool:
@@ -47,7 +47,7 @@ def spanning(pieces: Sequence[Cylinder], best: int) -> Cylinder:
 
 
 def elbows(cylinders: Sequence[Cylinder]) -> set[int]:
-    """Which cylinders are the middle of an elbow: short, as thick as a longer pipe that goes on beside an end, at an angle."""
+    """Which cylinders are the middle of an elbow: short, beside an end of a longer one as thick, at an angle to it."""
     found = set()
     for i, one in enumerate(cylinders):
         if one.length > 6.0 * one.radius:
@@ -71,14 +71,13 @@ def _one_pipe(one: Cylinder, other: Cylinder) -> bool:
         return False
     along = np.array([(end - longer.start) @ longer.axis for end in (shorter.start, shorter.end)])
     gap = max(float(along.min()) - longer.length, -float(along.max()))
-    offset = max(
-        float(np.linalg.norm(end - longer.start - t * longer.axis))
-        for end, t in zip((shorter.start, shorter.end), along, strict=True)
-    )
+    facing = (shorter.start, shorter.end)[int(np.argmin(np.abs(along - 0.5 * longer.length)))]
+    aside = facing - longer.start
+    offset = float(np.linalg.norm(aside - (aside @ longer.axis) * longer.axis))
     if offset > _OFFSET * radius + _LEAST_OFFSET:
         return False
     close = offset < 0.5 * _OFFSET * radius + _LEAST_OFFSET
-    return gap < max(10.0 * radius, 0.3, shorter.length if close else 0.0, 15.0 * radius if close else 0.0)
+    return gap < max(10.0 * radius, 0.3, max(shorter.length, 15.0 * radius) if close else 0.0)
 
 
 def _axis_distance(one: Cylinder, other: Cylinder, steps: int = 9) -> float:

@@ -47,6 +47,11 @@ class Candidate:
     evidence: Evidence
 
     @property
+    def blurred(self) -> bool:
+        """Whether the noise hides the section: a thin pipe and the edge of a plate look the same."""
+        return self.evidence.noise > _BLURRED * self.cylinder.radius
+
+    @property
     def band(self) -> float:
         """Width [m] that counts as one standard deviation when points are taken for its surface."""
         return 1.2 * self.evidence.noise + 2e-4
@@ -72,7 +77,7 @@ def measure(tree: Octree, free: IntArray | np.ndarray, initial: Cylinder, sigma:
             return None
         grown = np.inf
         if turn:
-            runs = _seen_runs(points, cylinder, wide, _longest_gap(cylinder.radius))
+            runs = _seen_runs(points, cylinder, wide)
             if not runs:
                 return None
             low, high = runs[0].low, runs[-1].high
@@ -88,25 +93,26 @@ def measure(tree: Octree, free: IntArray | np.ndarray, initial: Cylinder, sigma:
             break
     margin = cylinder.radius * cylinder.axis
     rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, 1.5 * cylinder.radius + 6.0 * wide)
-    return settle(tree.points[rows[free[rows]]], cylinder, wide, _longest_gap(cylinder.radius))
+    return settle(tree.points[rows[free[rows]]], cylinder, wide)
 
 
-def settle(points: FloatArray, cylinder: Cylinder, wide: float, gap: float) -> Candidate | None:
+def settle(points: FloatArray, cylinder: Cylinder, wide: float, whole: bool = False) -> Candidate | None:
     """Measure a cylinder that is nearly right on the points (N, 3) around it, all of which are its own or nobody's.
 
-    Points within three times `wide` [m] are its surface; stretches of it apart by less than `gap` [m] are one pipe.
+    Points within three times `wide` [m] are its surface. A `whole` cylinder is known to be one pipe between its ends,
+    whatever the gaps; otherwise it is followed as far as it is straight and its gaps are such as a clamp explains.
     """
-    near = points[np.abs(_signed_distance(points, cylinder)) < 5.0 * wide]
+    near = points[np.abs(_signed_distance(points, cylinder)) < max(5.0 * wide, 0.2 * cylinder.radius)]
     # A cap closes the end: its points lie within the barrel all around, and would draw the radius in.
     body = _within(near, cylinder, _without_caps(cylinder, wide))
     fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), None, cylinder, wide, reach=1.0)
     if fit is None:
         return None
-    radius_sigma = float(np.hypot(fit.radius_sigma, fit.rmse**2 / fit.cylinder.radius))
+    radius_sigma = float(np.hypot(fit.radius_sigma, 0.5 * fit.rmse**2 / fit.cylinder.radius))
     if fit.rmse > _BLURRED * cylinder.radius:
         fit, radius_sigma = _by_width(body, cylinder, fit, wide)
     cylinder = _between(fit.cylinder, cylinder)
-    runs = _seen_runs(near, cylinder, wide, gap)
+    runs = _shown_runs(near, cylinder, wide) if whole else _seen_runs(near, cylinder, wide)
     if not runs:
         return None
     cut = _cut(cylinder, runs[0].low, runs[-1].high)
@@ -159,9 +165,10 @@ def own_points(points: FloatArray, cylinder: Cylinder, others: Sequence[Cylinder
 def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: float) -> tuple[CylinderFit, float]:
     """Fit at the radius that the width of a blurred pipe's points tells, and that radius's standard deviation [m].
 
-    A sensor's rays meet a pipe evenly over its width until they graze it: seen from one side, the points spread over
-    2 r s with s = sin(70 deg) at least, and so by r s / sqrt(3); the noise across the ray, a third of that along it
-    for a scanner, as much for a fused cloud, adds to that and is taken in between.
+    Over a half of the circumference seen, up to 70 or 75 deg from the front, the points' coordinate across has a
+    variance of 0.31 r^2 where a scanner's rays meet it (evenly over the width) and of 0.40 r^2 where the points lie
+    evenly on the surface; the noise across the ray, a third of that along it for a scanner, as much for a fused
+    cloud, adds to that. Both are taken in between.
     """
     axis = fit.cylinder.axis
     offset = points - fit.cylinder.start
@@ -174,15 +181,14 @@ def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: fl
         values, vectors = np.linalg.eigh(centred.T @ centred / len(centred))
         along = centred @ vectors[:, 2]
         near = near[np.abs(along) < 2.5 * np.sqrt(values[2])]
-    seen = 0.96
     noise = 0.65 * fit.rmse
     square = max(float(values[2]) - noise**2, 0.25 * float(values[2]))
-    radius = float(np.sqrt(3.0 * square) / seen)
+    radius = float(np.sqrt(square / 0.355))
     again = fit_cylinder(
         _spread_out(points, _FINAL_POINTS), None, replace(cylinder, radius=radius), wide, reach=1.0, fixed_radius=radius
     )
-    # The share of the noise across is known to a third of it, the seen width to a twentieth.
-    sigma = float(np.hypot(0.05 * radius, 1.5 * 0.5 * noise**2 / radius))
+    # The share of the noise across is known to a third of it, the variance of the seen part to a seventh.
+    sigma = float(np.hypot(0.07 * radius, 1.5 * 0.5 * noise**2 / radius))
     return (again or fit), sigma
 
 
@@ -224,15 +230,28 @@ def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(square, 0.0)) - cylinder.radius)
 
 
-def _seen_runs(points: FloatArray, cylinder: Cylinder, wide: float, gap: float) -> list[Run]:
+def _seen_runs(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Run]:
     """Stretches of the axis that show surface and lie on one line, without an elbow at an end."""
-    skin = points[np.abs(_signed_distance(points, cylinder)) < 3.0 * wide]
-    if len(skin) < 30:
+    distance = np.abs(_signed_distance(points, cylinder))
+    skin = distance < 3.0 * wide
+    if skin.sum() < 30:
         return []
-    straight = straight_stretch(skin, cylinder, wide)
+    # An elbow that leaves a narrow band shows its front only, which does not tell where it went.
+    straight = straight_stretch(points[distance < max(3.0 * wide, 0.2 * cylinder.radius)], cylinder, wide)
     if straight is None:
         return []
-    return _connected(surface_runs(_within(skin, cylinder, straight), cylinder), gap, cylinder.radius)
+    return _connected(
+        surface_runs(_within(points[skin], cylinder, straight), cylinder),
+        _longest_gap(cylinder.radius),
+        cylinder.radius,
+    )
+
+
+def _shown_runs(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Run]:
+    """Stretches between the cylinder's ends that show surface."""
+    skin = points[np.abs(_signed_distance(points, cylinder)) < 3.0 * wide]
+    runs = surface_runs(_within(skin, cylinder, Run(0.0, cylinder.length)), cylinder)
+    return [run for run in runs if run.length > max(0.5 * cylinder.radius, 0.015)]
 
 
 def _longest_gap(radius: float) -> float:
@@ -269,7 +288,7 @@ def _between(line: Cylinder, ends: Cylinder) -> Cylinder:
 
 
 def _without_caps(cylinder: Cylinder, wide: float) -> Run:
-    cap = min(5.0 * wide + 5e-3, 0.2 * cylinder.length)
+    cap = min(5.0 * wide + 0.015, 0.2 * cylinder.length)
     return Run(cap, cylinder.length - cap)
 
 

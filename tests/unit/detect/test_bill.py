@@ -1,0 +1,85 @@
+"""Bills of quantities: what is read, and what a wrong one is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.bill import NAMED_COLORS, load_bill
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "boq.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def entry(text: str) -> str:
+    return f"classes: [{{name: DN65, planned_length_m: 3.0, {text}}}]"
+
+
+def test_radius_or_diameter_and_colours(tmp_path: Path) -> None:
+    text = """
+classes:
+  - {name: DN100, outer_radius_mm: 57.5, planned_length_m: 24.0}
+  - {name: DN65, outer_diameter_mm: 73, planned_length_m: 3, color: '#ff8000'}
+  - {name: 17, outer_radius_mm: 20, planned_length_m: 2.0, color: Teal}
+  - {name: odd, outer_radius_mm: 44, planned_length_m: 2.0}
+  - {name: odder, outer_radius_mm: 45, planned_length_m: 2.0}
+"""
+    classes = load_bill(written(tmp_path, text)).classes
+    assert [c.name for c in classes] == ["DN100", "DN65", "17", "odd", "odder"]
+    assert [c.outer_radius for c in classes] == pytest.approx([0.0575, 0.0365, 0.02, 0.044, 0.045])
+    assert classes[0].color == NAMED_COLORS["cyan"]
+    assert classes[1].color == pytest.approx((1.0, 128 / 255, 0.0))
+    assert classes[2].color == NAMED_COLORS["teal"]
+    assert len({c.color for c in classes}) == 5
+    assert all(0 < c.tolerance < 0.02 * c.outer_radius for c in classes)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("classes: []", "list at least one class"),
+        ("", "begins with 'classes:'"),
+        ("- 1", "begins with 'classes:'"),
+        ("classes: {a: [", "is no YAML"),
+        ("clases: [{name: a}]", "did you mean 'classes'"),
+        ("classes: [3]", "class 1 is 3"),
+        ("classes: [{outer_radius_mm: 3, planned_length_m: 1}]", "give each class a name"),
+        (entry("outer_radius_mm: -3"), "outer_radius_mm is -3: write a number above zero"),
+        (entry("outer_radius_mm: 0"), "write a number above zero"),
+        (entry("outer_radius_mm: .nan"), "write a number above zero"),
+        (entry("outer_radius_mm: wide"), "outer_radius_mm is 'wide': write a number"),
+        (entry("outer_radius_mm: true"), "write a number"),
+        (entry("outer_radius_mm: 3, outer_diameter_mm: 6"), "and not both"),
+        (entry("color: red"), "needs either outer_radius_mm or outer_diameter_mm"),
+        (entry("outer_radius_mm: 3, colour: red"), "unknown key 'colour' in class 'DN65': did you mean 'color'"),
+        (entry("outer_radius_mm: 3, color: gren"), "did you mean 'green'"),
+        ("classes: [{name: a, outer_radius_mm: 3}]", "has no planned_length_m"),
+        ("classes: [{name: a, outer_radius_mm: 3, planned_length_m: -1}]", "planned_length_m is -1"),
+        (
+            "classes: [{name: a, outer_radius_mm: 3, planned_length_m: 1}, "
+            "{name: a, outer_radius_mm: 4, planned_length_m: 1}]",
+            "listed twice",
+        ),
+        (
+            "classes: [{name: a, outer_radius_mm: 3, planned_length_m: 1}, "
+            "{name: b, outer_diameter_mm: 6, planned_length_m: 1}]",
+            "cannot be told apart",
+        ),
+    ],
+)
+def test_a_wrong_bill_is_told_what_to_mend(tmp_path: Path, text: str, told: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        load_bill(path)
+    assert told in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_bill_names_its_path(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.yaml: cannot read"):
+        load_bill(tmp_path / "none.yaml")
