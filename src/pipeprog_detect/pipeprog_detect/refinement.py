@@ -88,6 +88,9 @@ class Jury:
                 found.append(measured)
         return found
 
+    def _is_planned(self, fit: ContourFit) -> bool:
+        return classify(fit.cylinder.radius, fit.radius_sigma, self._bill)[0] is not None
+
     def _refined(self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]) -> ContourFit | None:
         if not views:
             return None
