@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -98,12 +98,20 @@ class Jury:
         # The surface may lie as far from its points' mean as they scatter: the cloud's sigma knows of noise alone.
         sigma = max(candidate.radius_sigma, candidate.evidence.noise)
         cylinder = candidate.cylinder
-        for _ in range(MAX_ROUNDS):
-            fit = refine(cylinder, sigma, views, others, self._config, planned_radii)
-            if fit is None or abs(fit.cylinder.radius - cylinder.radius) < SETTLED * cylinder.radius:
-                break
-            cylinder = fit.cylinder
-        return fit
+        starts = [cylinder.radius]
+        if candidate.blurred:  # the cloud does not know the radius: the planned ones within its reach are tried, too
+            starts += [radius for radius in planned_radii if abs(radius - cylinder.radius) < 3.0 * sigma]
+        fits = []
+        for radius in starts:
+            start = replace(cylinder, radius=radius)
+            for _ in range(MAX_ROUNDS):
+                fit = refine(start, sigma, views, others, self._config, planned_radii)
+                if fit is None or abs(fit.cylinder.radius - start.radius) < SETTLED * start.radius:
+                    break
+                start = fit.cylinder
+            if fit is not None:
+                fits.append(fit)
+        return max(fits, key=lambda fit: fit.support, default=None)
 
 
 def _contains(cylinder: Cylinder, point: FloatArray) -> bool:
