@@ -42,13 +42,16 @@ from pipeprog_sfm.board import load_boards
 IN_FLIGHT = 8  # frames that the selector may not have decided on yet; above its window, or it would wait for ever
 START_SECONDS = 90.0  # until all nodes have found each other: imports of a cold disk included
 SILENCE_SECONDS = 60.0  # a node whose diagnostics (1 Hz) stay away that long hangs
+# Between two decisions lie a few keyframes at most; the slowest machine works one off in less.
+STANDSTILL_SECONDS = 300.0
+_MOVING = ("choosing keyframes", "working off the last keyframes")  # stages in which decisions and feedback arrive
 DELIVERY_SECONDS = 60.0  # for the last messages, once the node has said that they are published
 
 IMAGE_TYPES = {cdr.COMPRESSED_IMAGE: (CompressedImage, "image/compressed"), cdr.IMAGE: (Image, "image")}
 # Subscribers of each topic within the graph, the command itself included, before the first image is worth sending.
 _SUBSCRIBERS = {
-    "keyframes/image/compressed": 3,
-    "keyframes/camera_info": 3,
+    "keyframes/image/compressed": 2,
+    "keyframes/camera_info": 2,
     "image_overlap": 2,
     "map_points": 1,
     "keyframe_poses": 1,
@@ -125,10 +128,11 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     parameters["detect"] |= {"boq": str(request.boq.resolve()), "intermediate": False}
     with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
         run = _Run(bag, request, report)
+        with private_domain(scratch), Graph(parameters, scratch, modules) as graph, _ros():
+            survey, status = run.through(graph)
         with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
-            with private_domain(scratch), Graph(parameters, scratch, modules) as graph, _ros():
-                survey, status = run.through(graph, recording)
             record_survey(recording, survey, status)
+            record_keyframes(recording, bag, run.log)
         timings = run.timings
         started = time.monotonic()
         pipes = [_pipe(pipe) for pipe in survey.pipes.pipes]
@@ -175,10 +179,12 @@ class _Run:
         self._status = msg.SfmStatus()
         self._heard: dict[str, float] = {}
         self._latest: dict[type, Any] = {}
+        self._moved = time.monotonic()
+        self._answered = 0
 
-    def through(self, graph: Graph, recording: BagWriter) -> tuple[_Survey, msg.SfmStatus]:
+    def through(self, graph: Graph) -> tuple[_Survey, msg.SfmStatus]:
         """Play every frame, let each node finish, and collect the last messages."""
-        self._graph, self._recording = graph, recording
+        self._graph = graph
         self._node = Node("replay")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -186,9 +192,9 @@ class _Run:
             self._connect()
             with self._timed("start", "starting the nodes"):
                 self._wait_until(self._is_connected, START_SECONDS, self._missing_connections)
-            with self._timed("play", "choosing keyframes"):
+            with self._timed("play", _MOVING[0]):
                 played = self._play()
-            with self._timed("frames", "last keyframes"):
+            with self._timed("frames", _MOVING[1]):
                 keyframes = self._finish("frames", played)
                 self._wait_until(
                     lambda: not self.log.in_flight,
@@ -218,17 +224,9 @@ class _Run:
         node.create_subscription(msg.ImageOverlapArray, "image_overlap", self._on_overlap, qos.reliable(1000))
         node.create_subscription(msg.SfmStatus, "sfm_status", self._on_status, qos.latched())
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        for topic, kind in (("keyframes/image/compressed", CompressedImage), ("keyframes/camera_info", CameraInfo)):
-            node.create_subscription(kind, topic, self._recorder(topic, kind), qos.reliable(1000), raw=True)
         self._services = {
             name: node.create_client(srv.Finish, f"{name}/finish") for name in ("frames", "sfm", "detect")
         }
-
-    def _recorder(self, topic: str, kind: type) -> Callable[[bytes], None]:
-        def record(data: bytes) -> None:
-            self._recording.write(f"/{topic}", type_name(kind), data, cdr.read_header(data)[0])
-
-        return record
 
     def _is_connected(self) -> bool:
         return not self._missing_connections()
@@ -260,6 +258,7 @@ class _Run:
                 due = begun + (frame.stamp - first) * 1e-9 / self._rate
                 while time.monotonic() < due:
                     self._spin(due - time.monotonic())
+                    self._moved = time.monotonic()
             self._send(frame)
             played += 1
             self._spin(0.0)
@@ -268,11 +267,8 @@ class _Run:
         return played
 
     def _send(self, frame: Frame) -> None:
-        info = deserialize_message(frame.camera_info, CameraInfo)
-        # The calibration in force goes out under the stamp of its image, as image_transport would pair them.
-        info.header = messages.header(frame.stamp, frame.frame_id)
         self.log.play(frame.stamp)
-        self._infos.publish(info)
+        self._infos.publish(_info(frame))
         self._images.publish(frame.data)
 
     def _finish(self, name: str, expected: int) -> int:
@@ -314,6 +310,11 @@ class _Run:
         self._executor.spin_once(timeout_sec=min(max(seconds, 0.0), 0.1))
         self._graph.check()
         now = time.monotonic()
+        if self._stage in _MOVING and now - self._moved > STANDSTILL_SECONDS:
+            raise NodeFailure(
+                f"nothing has moved for {STANDSTILL_SECONDS:.0f} s while {self._stage}: frames has decided on "
+                f"{self.log.considered} images, sfm has worked off {self._answered} of {self.log.chosen} keyframes"
+            )
         for name, heard in self._heard.items():
             if now - heard > SILENCE_SECONDS:
                 raise NodeFailure(f"the node {name} has said nothing for {SILENCE_SECONDS:.0f} s: it hangs")
@@ -337,11 +338,12 @@ class _Run:
     @contextlib.contextmanager
     def _timed(self, name: str, stage: str) -> Iterator[None]:
         self._stage = stage
-        started = time.monotonic()
+        started = self._moved = time.monotonic()
         yield
         self.timings[name] = round(time.monotonic() - started, 3)
 
     def _on_decision(self, message: msg.FrameDecision) -> None:
+        self._moved = time.monotonic()
         self.log.decide(
             results.FrameRow(
                 messages.stamp_ns(message.header.stamp),
@@ -354,6 +356,8 @@ class _Run:
         )
 
     def _on_overlap(self, message: msg.ImageOverlapArray) -> None:
+        self._moved = time.monotonic()
+        self._answered = message.keyframes_considered
         for image in message.images:
             self.log.overlap(messages.stamp_ns(image.stamp), image.overlap, image.registered)
 
@@ -384,6 +388,29 @@ def record_survey(recording: BagWriter, survey: _Survey, status: msg.SfmStatus) 
     recorded = [(topic, getattr(survey, name)) for name, topic in _SURVEY_TOPICS.items()] + [("sfm_status", status)]
     for topic, message in recorded:
         recording.write(f"/{topic}", type_name(type(message)), serialize_message(message), stamp)
+
+
+def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
+    """The keyframes into out.mcap, with the calibration that each went out with."""
+    chosen = {row.stamp for row in log.rows() if row.chosen}
+    for frame in bag:
+        if frame.stamp not in chosen or not cdr.is_whole(frame.data, bag.image_type):
+            continue
+        chosen.remove(frame.stamp)
+        data = frame.data
+        if bag.image_type == cdr.IMAGE:
+            encoded = messages.encode_jpeg(messages.image_from_msg(deserialize_message(data, Image)))
+            data = cdr.write_compressed_image(frame.stamp, frame.frame_id, "jpeg", encoded)
+        info = serialize_message(_info(frame))
+        recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, info, frame.stamp)
+        recording.write("/keyframes/image/compressed", cdr.COMPRESSED_IMAGE, data, frame.stamp)
+
+
+def _info(frame: Frame) -> CameraInfo:
+    """The calibration in force, under the stamp of its image, as image_transport would pair them."""
+    info = deserialize_message(frame.camera_info, CameraInfo)
+    info.header = messages.header(frame.stamp, frame.frame_id)
+    return info
 
 
 _SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}

@@ -29,6 +29,7 @@ from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 
 MAX_QUEUE = 30  # one second of a fast camera; more would only be late
+LISTENERS = 2  # in lockstep: SfM and detector, without whom the first keyframe would be lost
 MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
 REDUCED = {
     1: cv2.IMREAD_GRAYSCALE,
@@ -66,7 +67,11 @@ class FramesNode(Node):
             subscribe(CompressedImage, "image/compressed", self._on_image)
         if self._config.image_transport != "compressed":
             subscribe(Image, "image", self._on_image)
-        self.create_subscription(ImageOverlapArray, "image_overlap", self._on_overlap, qos.reliable(50))
+        self._overlaps = self.create_subscription(
+            ImageOverlapArray, "image_overlap", self._on_overlap, qos.reliable(50)
+        )
+        if self._config.lockstep:
+            self._connecting = self.create_timer(0.1, self._start_when_connected)
         # In a group of its own: while it waits for the end, the other callbacks must run.
         self.create_service(Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "keyframes", self._health)
@@ -93,6 +98,16 @@ class FramesNode(Node):
                 throttle_duration_sec=10.0,
             )
         self._drain()
+
+    def _start_when_connected(self) -> None:
+        if self._is_connected():
+            self._connecting.cancel()
+            self._drain()
+
+    def _is_connected(self) -> bool:
+        """Whether the SfM and the detector hear the keyframes: what is published before is never heard."""
+        listeners = min(self._images.get_subscription_count(), self._infos.get_subscription_count())
+        return listeners >= LISTENERS and self._overlaps.get_publisher_count() > 0
 
     def _on_overlap(self, message: ImageOverlapArray) -> None:
         self._acknowledged = max(self._acknowledged, message.keyframes_considered)
@@ -182,6 +197,8 @@ class FramesNode(Node):
         """Publishes what is chosen; False while the SfM must catch up first (lockstep)."""
         while self._keyframes:
             if self._config.lockstep:
+                if not self._published and not self._is_connected():
+                    return False
                 if len(self._published) - self._acknowledged >= MAX_AHEAD:
                     return False
                 self._apply_feedback(len(self._published) + 1 - MAX_AHEAD)
