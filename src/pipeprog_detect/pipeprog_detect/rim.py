@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from pipeprog_detect.edges import LINEAR_LIGHT, outline_edges
 from pipeprog_detect.outline import camera_centre, project
@@ -18,8 +18,13 @@ from pipeprog_detect.support import hits, support_profile
 HALF_ARC, SECTORS, RAYS_PER_SECTOR = np.radians(70.0), 6, 4
 # Samples for one pixel along the axis.
 SAMPLES_PER_PIXEL = 2
-# The outlines must stop: their support falls by this much from inside the end to outside.
-MIN_CONTRAST = 0.3
+# The outlines must stop: from inside the end to outside their support (0 to 1) falls by so much, or, where little of
+# the pipe can be told from its background, by this share of it; so much support is chance.
+MIN_FALL, MIN_SHARE, CHANCE = 0.3, 0.45, 0.1
+MIN_SEEN = 14
+# A rim at the edge of the searched range needs so much more of a score than one at the given end; and of two the inner
+# one ends the barrel: an elbow or a collar has further rims outside.
+FAR_PENALTY, OUTER_PENALTY = 0.3, 0.3
 
 
 @dataclass(frozen=True)
@@ -51,8 +56,8 @@ def find_end(
     inside = min(outside, 0.6 * cylinder.length)
     distances = [np.linalg.norm(end - camera_centre(view)) for view in views]
     pixel = float(np.median(distances)) / views[0].camera.fx
-    position, contrast = _contrast(cylinder, axis, end, inside, outside, pixel, views, others, basis, view_offset, blur)
-    if not len(position) or contrast.max() < MIN_CONTRAST:
+    position, fall = _falls(cylinder, axis, end, inside, outside, pixel, views, others, basis, view_offset, blur)
+    if not len(position) or fall.max() < 0.0:
         return None
     along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL, dtype=float)
     slopes = [_slopes(axis, end, cylinder.radius, along, view) for view in views]
@@ -64,14 +69,15 @@ def find_end(
     strength = np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0)
     count = seen.sum(axis=0)
     vote = strength.sum(axis=0) / (count + SECTORS)
-    score = np.interp(along, position, contrast, left=-1.0, right=-1.0) + vote
+    score = np.interp(along, position, fall, left=-1.0, right=-1.0) + vote
+    score -= FAR_PENALTY * (along / outside) ** 2 + OUTER_PENALTY * np.maximum(along, 0.0) / outside
     best = int(np.argmax(score))
-    if np.interp(along[best], position, contrast) < MIN_CONTRAST:
+    if np.interp(along[best], position, fall) < 0.0:
         return None
     return _refined(strength, seen, along, best, pixel)
 
 
-def _contrast(
+def _falls(
     cylinder: Cylinder,
     axis: FloatArray,
     end: FloatArray,
@@ -84,7 +90,7 @@ def _contrast(
     view_offset: FloatArray,
     blur: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions along `axis` from `end` and how much the support of the outlines falls there."""
+    """Positions along `axis` from `end` and how much the support of the outlines falls there, -1 where too little."""
     stretch = Cylinder(end - inside * axis, end + outside * axis, cylinder.radius)
     at, edges = outline_edges(stretch, views, others, basis, view_offset, 1.5, blur, 6)
     if not len(at):
@@ -97,9 +103,12 @@ def _contrast(
     for index, here in enumerate(position):
         before = (position > here - window) & (position <= here)
         after = (position > here) & (position <= here + window)
-        if seen[before].sum() >= 12 and seen[after].sum() >= 12:
-            fall[index] = found[before].sum() / seen[before].sum() - found[after].sum() / seen[after].sum()
-    return position, fall
+        if seen[before].sum() >= MIN_SEEN and seen[after].sum() >= MIN_SEEN:
+            inner, outer = (found[part].sum() / seen[part].sum() for part in (before, after))
+            if inner - outer >= min(MIN_FALL, MIN_SHARE * (inner + CHANCE)):
+                fall[index] = inner - outer
+    # The rim decides within the coarse step of the stations.
+    return position, maximum_filter1d(fall, 3)
 
 
 def _slopes(axis: FloatArray, end: FloatArray, radius: float, along: FloatArray, view: View) -> FloatArray:
