@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import multiprocessing
 import multiprocessing.connection
+import os
 import signal
 import threading
 from collections import deque
@@ -33,6 +34,7 @@ class WorkerProcess:
         on_event: Callable[[Any], None],
         on_death: Callable[[int], None],
     ) -> None:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for the child: on small matrices BLAS threads only spin
         context = multiprocessing.get_context("spawn")  # fork would copy the middleware's threads half alive
         self._connection, child = context.Pipe()
         self._process = context.Process(target=_child_main, args=(child, serve, arguments), daemon=True)

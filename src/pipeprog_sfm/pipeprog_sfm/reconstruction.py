@@ -174,10 +174,8 @@ class Reconstruction:
     def _start_depth_maps(self, stamps: Sequence[int], poses: dict[int, FloatArray]) -> None:
         if not stamps:
             return
-        points = self._mapper.points().points_in_model
         for stamp in stamps:
-            index, _ = self._mapper.observations(stamp)
-            depth = points[index] @ poses[stamp][2, :3] + poses[stamp][2, 3]
+            depth = self._mapper.depths(stamp)
             depth = depth[depth > 0]
             if len(depth) < 10:
                 continue
