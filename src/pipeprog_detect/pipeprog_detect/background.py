@@ -51,26 +51,29 @@ def find_planes(tree: Octree, sigma: float, widest_radius: float) -> tuple[list[
             continue
         plane = Plane(axes[:, 0], float(axes[:, 0] @ centre), float(sizes[region]) * cells.size**2)
         planes.append(plane)
-        taken |= _on_region(tree, cells, plane, members, neighbours, mean, band)
+        taken[_on_region(tree, cells, plane, members, neighbours, mean, band)] = True
     return planes, taken
 
 
 def _on_region(
     tree: Octree, cells: Cells, plane: Plane, members: IntArray, neighbours: IntArray, mean: FloatArray, band: float
-) -> NDArray[np.bool_]:
-    """Points within `band` of the locally smoothed region (walls are wavy) in its cells and the cells around."""
+) -> IntArray:
+    """Rows of the points within `band` of the locally smoothed region (walls are wavy), in its cells and around."""
     offset: FloatArray = np.full(len(mean), np.nan)
     offset[members] = mean[members] @ plane.normal - plane.offset
     # The offset of a cell outside is the mean of its neighbours inside, twice over.
+    ring = members
     for _ in range(2):
-        around = np.where(neighbours >= 0, offset[neighbours], np.nan)
-        known = np.isfinite(around)
-        count = known.sum(axis=1)
-        filled = np.where(count > 0, np.nansum(around, axis=1) / np.maximum(count, 1), np.nan)
-        offset = np.where(np.isfinite(offset), offset, filled)
-    per_point = np.repeat(offset, cells.counts)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.abs(tree.points @ plane.normal - plane.offset - per_point) < band)
+        ring = np.unique(neighbours[ring])
+        ring = ring[ring >= 0]
+        outside = ring[np.isnan(offset[ring])]
+        around = np.where(neighbours[outside] >= 0, offset[neighbours[outside]], np.nan)
+        count = np.isfinite(around).sum(axis=1)
+        offset[outside] = np.nansum(around, axis=1) / np.maximum(count, 1)
+    near = np.flatnonzero(np.isfinite(offset))
+    rows = np.concatenate([np.arange(cells.starts[c], cells.starts[c + 1]) for c in near])
+    height = tree.points[rows] @ plane.normal - plane.offset - np.repeat(offset[near], cells.counts[near])
+    return np.asarray(rows[np.abs(height) < band])
 
 
 @njit(cache=True)

@@ -143,11 +143,13 @@ def _settled(
             band = accepted[best].band
             margin = cylinder.radius * cylinder.axis
             reach = 1.5 * cylinder.radius + 6.0 * band
-            rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
             others = [accepted[k].cylinder for k in range(len(accepted)) if k not in pieces]
-            points = own_points(
-                tree.points[rows], cylinder, [other for other in others if near(other, cylinder, reach)]
-            )
+            others = [other for other in others if near(other, cylinder, reach)]
+            if len(pieces) == 1 and not others:
+                settled.append(accepted[best])
+                continue
+            rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
+            points = own_points(tree.points[rows], cylinder, others)
             candidate = settle(points, cylinder, band, whole=turn > 0 or len(pieces) > 1)
             if candidate is not None and is_pipe(candidate, sigma, config, _PROPOSED):
                 settled.append(candidate)
@@ -163,9 +165,11 @@ def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig, roughness:
     evidence, cylinder = candidate.evidence, candidate.cylinder
     # The smaller the arc, the more surfaces that are no pipe fit it: its length has to make up for that.
     slender = 3.0 if evidence.arc > np.radians(80.0) else 6.0
+    # A thin pipe stands clear of what is behind it and shows its half; a strip of a surface does not.
+    vague = candidate.radius_sigma > 0.05 * cylinder.radius
     return (
         cylinder.length >= max(slender * cylinder.radius, config.length_min)
-        and evidence.arc >= np.radians(config.arc_min_deg)
+        and evidence.arc >= np.radians(max(config.arc_min_deg, 100.0) if vague else config.arc_min_deg)
         and evidence.coverage > 0.4
         and evidence.inside < 0.15
         and evidence.noise < roughness * (1.6 * sigma + 8e-4)

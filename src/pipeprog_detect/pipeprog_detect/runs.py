@@ -18,7 +18,11 @@ _LEAST_OFFSET = 4e-3
 
 def near(one: Cylinder, other: Cylinder, reach: float) -> bool:
     """Whether the axes of two cylinders come nearer than their radii and `reach` [m]."""
-    return _axis_distance(one, other) < one.radius + other.radius + reach
+    allowed = one.radius + other.radius + reach
+    apart = float(np.linalg.norm(0.5 * (one.start + one.end - other.start - other.end)))
+    if apart > 0.5 * (one.length + other.length) + allowed:
+        return False
+    return _axis_distance(one, other) < allowed
 
 
 def join(cylinders: Sequence[Cylinder]) -> list[list[int]]:
