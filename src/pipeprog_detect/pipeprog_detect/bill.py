@@ -11,6 +11,7 @@ from pathlib import Path
 import yaml
 
 from pipeprog_camera.errors import InputError
+from pipeprog_detect.sizes import find_size, nearest_name
 
 Color = tuple[float, float, float]
 
@@ -44,7 +45,8 @@ NAMED_COLORS: dict[str, Color] = {
 _FIGURE_11 = {0.0086: "magenta", 0.0365: "blue", 0.0575: "cyan", 0.0841: "green", 0.1095: "red", 0.1223: "yellow"}
 _OTHERS = ("orange", "purple", "lime", "brown", "teal", "pink", "navy", "olive", "maroon", "silver")
 
-_KEYS = ("name", "outer_radius_mm", "outer_diameter_mm", "planned_length_m", "color")
+_SIZE_KEYS = ("outer_radius_mm", "outer_diameter_mm", "size")
+_KEYS = ("name", *_SIZE_KEYS, "planned_length_m", "color")
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,9 @@ class Bill:
 
 
 def load_bill(path: str | Path) -> Bill:
-    """Read BOQ.yaml (`classes:` with name, outer_radius_mm or outer_diameter_mm, planned_length_m, color).
+    """Read BOQ.yaml (`classes:` with name, planned_length_m, color and a size).
+
+    The size is outer_radius_mm, outer_diameter_mm or `size`, a standard one such as `DN50 steel` (see sizes).
 
     Raises InputError, naming the file, the value and the remedy, for anything that is no bill.
     """
@@ -112,17 +116,29 @@ def _read_class(path: Path, where: str, entry: object) -> PipeClass:
     name = str(name).strip()
     where = f"class '{name}'"
     _refuse_unknown(path, where, entry, _KEYS)
-    if ("outer_radius_mm" in entry) == ("outer_diameter_mm" in entry):
-        raise InputError(f"{path}: {where} needs either outer_radius_mm or outer_diameter_mm, and not both")
-    if "outer_radius_mm" in entry:
-        radius = 1e-3 * _positive(path, where, "outer_radius_mm", entry["outer_radius_mm"])
-    else:
-        radius = 0.5e-3 * _positive(path, where, "outer_diameter_mm", entry["outer_diameter_mm"])
+    radius, tolerance = _read_size(path, where, entry)
     if "planned_length_m" not in entry:
         raise InputError(f"{path}: {where} has no planned_length_m: give the metres that are planned")
     length = _positive(path, where, "planned_length_m", entry["planned_length_m"])
-    tolerance = max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE)
     return PipeClass(name, radius, length, (0.5, 0.5, 0.5), tolerance)
+
+
+def _read_size(path: Path, where: str, entry: dict[str, object]) -> tuple[float, float]:
+    """Outer radius and its tolerance [m]."""
+    given = [key for key in _SIZE_KEYS if key in entry]
+    if len(given) != 1:
+        raise InputError(
+            f"{path}: {where} needs one of {', '.join(_SIZE_KEYS)}, not {' and '.join(given) if given else 'none'}"
+        )
+    value = entry[given[0]]
+    if given[0] == "size":
+        size = find_size(str(value))
+        if size is None:
+            raise InputError(f"{path}: {where}: unknown size '{value}': did you mean '{nearest_name(str(value))}'?")
+        return 0.5 * size.outer_diameter, 0.5 * size.tolerance
+    millimetres = _positive(path, where, given[0], value)
+    radius = 1e-3 * millimetres * (1.0 if given[0] == "outer_radius_mm" else 0.5)
+    return radius, max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE)
 
 
 def _positive(path: Path, where: str, key: str, value: object) -> float:

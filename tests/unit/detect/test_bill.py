@@ -40,6 +40,24 @@ classes:
 
 
 @pytest.mark.parametrize(
+    ("size", "diameter_mm"),
+    [
+        ("DN50 steel", 60.3),
+        ("steel dn 50", 60.3),
+        ("NPS 2-1/2 steel", 73.0),
+        ('NPS 2" steel', 60.3),
+        ("22 copper", 22.0),
+        ("copper 22 mm", 22.0),
+        ("DN110 PVC", 110.0),
+    ],
+)
+def test_standard_sizes(tmp_path: Path, size: str, diameter_mm: float) -> None:
+    (planned,) = load_bill(written(tmp_path, entry(f"size: '{size}'"))).classes
+    assert planned.outer_radius == pytest.approx(0.5e-3 * diameter_mm)
+    assert 0 < planned.tolerance < 0.02 * planned.outer_radius
+
+
+@pytest.mark.parametrize(
     ("text", "told"),
     [
         ("classes: []", "list at least one class"),
@@ -54,9 +72,14 @@ classes:
         (entry("outer_radius_mm: .nan"), "write a number above zero"),
         (entry("outer_radius_mm: wide"), "outer_radius_mm is 'wide': write a number"),
         (entry("outer_radius_mm: true"), "write a number"),
-        (entry("outer_radius_mm: 3, outer_diameter_mm: 6"), "and not both"),
-        (entry("color: red"), "needs either outer_radius_mm or outer_diameter_mm"),
+        (
+            entry("outer_radius_mm: 3, outer_diameter_mm: 6"),
+            "needs one of outer_radius_mm, outer_diameter_mm, size, not outer_radius_mm and outer_diameter_mm",
+        ),
+        (entry("color: red"), "needs one of outer_radius_mm, outer_diameter_mm, size, not none"),
         (entry("outer_radius_mm: 3, colour: red"), "unknown key 'colour' in class 'DN65': did you mean 'color'"),
+        (entry("size: DN50 stell"), "unknown size 'DN50 stell': did you mean 'DN50 steel'"),
+        (entry("size: 3"), "unknown size '3': did you mean"),
         (entry("outer_radius_mm: 3, color: gren"), "did you mean 'green'"),
         ("classes: [{name: a, outer_radius_mm: 3}]", "has no planned_length_m"),
         ("classes: [{name: a, outer_radius_mm: 3, planned_length_m: -1}]", "planned_length_m is -1"),
