@@ -35,8 +35,8 @@ CANDIDATES = 3
 # Edges count within so many pixels of the vote's and of the refined outlines.
 COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
 MIN_STATIONS = 20
-# Cylinders that are not there stay under 0.1 (see `support`).
-MIN_SUPPORT = 0.25
+# Cylinders that are not there stay under 0.1 (see `support`); the stated sigma grows where little is seen.
+MIN_SUPPORT = 0.15
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def refine(
     config: ContourConfig,
     planned_radii: Sequence[float] = (),
 ) -> ContourFit | None:
-    """The cylinder that the outlines in all views agree on, or None where they say too little.
+    """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
     `initial_radius_sigma` [m] is the standard deviation of the given radius; that of the axis is taken as twice as
     much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote.
@@ -76,7 +76,7 @@ def refine(
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
     moves; then robust least squares on limb-aware sub-pixel edges. The ends follow from the rims (`rim.find_end`).
     """
-    if not views:
+    if not config.enabled or not views:
         return None
     basis = frame(cylinder, viewing_direction(cylinder, views))
     candidates = _vote(cylinder, initial_radius_sigma, views, others, basis, planned_radii)

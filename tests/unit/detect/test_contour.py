@@ -78,6 +78,7 @@ def test_same_input_same_result(pipe_views: list[View]) -> None:
 def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
     assert refine(PIPE, 0.004, empty_views, [], CONFIG) is None
     assert refine(PIPE, 0.004, [], [], CONFIG) is None
+    assert refine(PIPE, 0.004, empty_views, [], ContourConfig(enabled=False)) is None
     above = Cylinder(PIPE.start + 3.0 * UP, PIPE.end + 3.0 * UP, PIPE.radius)
     assert refine(above, 0.004, empty_views, [], CONFIG) is None
 
