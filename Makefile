@@ -39,7 +39,7 @@ $(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(I
 
 demo: setup ## the recording in bags/ through the node graph, and its report
 	@$(BIN)/pipeprog replay bags/demo.mcap --boq bags/demo.boq.yaml --board bags/demo.board.yaml --out $(DEMO) --force
-	@$(BIN)/pipeprog report $(DEMO) --out $(DEMO)/report.html
+	@$(BIN)/pipeprog report $(DEMO) --out $(DEMO)/report.html --force
 
 test: setup ## unit and integration tests
 	@$(BIN)/python -m pytest tests/unit tests/integration

@@ -83,7 +83,7 @@ def nodes_of(parent: int) -> dict[str, int]:
     return nodes
 
 
-def wait_for(condition, seconds: float = 20.0):  # type: ignore[no-untyped-def]
+def wait_for(condition, seconds: float = 20.0):
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         value = condition()

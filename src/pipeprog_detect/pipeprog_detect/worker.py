@@ -69,5 +69,7 @@ def serve(connection: Connection, config: DetectConfig, bill: Bill) -> None:
 
 def _view(keyframe: Keyframe, map_from_camera: NDArray[np.float64]) -> View:
     image = cv2.imdecode(np.frombuffer(keyframe.encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
-    pinhole = keyframe.camera.pinhole()
-    return View(keyframe.stamp, keyframe.camera.undistort_image(image), pinhole, np.linalg.inv(map_from_camera))
+    if image is None:
+        raise RuntimeError(f"keyframe {keyframe.stamp} has a pose but cannot be decoded")
+    camera_from_map = np.linalg.inv(map_from_camera).astype(float)
+    return View(keyframe.stamp, keyframe.camera.undistort_image(image), keyframe.camera.pinhole(), camera_from_map)

@@ -20,7 +20,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.ring import Frame, FrameRing
 from pipeprog_frames.selector import Decision, FrameSelector
-from pipeprog_frames.tracker import GrayImage, reduction
+from pipeprog_frames.tracker import GrayImage, is_cut_off, reduction
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
@@ -158,7 +158,7 @@ class FramesNode(Node):
         size = (-(-self._camera.width // factor), -(-self._camera.height // factor))
         if isinstance(message, CompressedImage):
             encoded = bytes(message.data)
-            gray = cv2.imdecode(np.frombuffer(encoded, np.uint8), REDUCED[factor]) if encoded else None
+            gray = None if is_cut_off(encoded) else cv2.imdecode(np.frombuffer(encoded, np.uint8), REDUCED[factor])
         else:
             try:
                 image = messages.image_from_msg(message)

@@ -29,6 +29,11 @@ def reduction(width: int) -> int:
     return max((factor for factor in (1, 2, 4, 8) if width // factor >= WORKING_WIDTH), default=1)
 
 
+def is_cut_off(encoded: bytes) -> bool:
+    """Whether these bytes are no whole image: the decoder paints the missing part of a JPEG grey and says nothing."""
+    return not encoded or (encoded.startswith(b"\xff\xd8") and b"\xff\xd9" not in encoded[-64:])
+
+
 def sharpness(gray: GrayImage) -> float:
     """Variance of the Laplacian; comparable among neighbouring frames only."""
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipeprog_detect.edges import limb_edges
 
-OFFSETS = np.arange(-10.0, 4.01, 0.5)
+OFFSETS: NDArray[np.float64] = np.arange(-10.0, 4.01, 0.5).astype(np.float64)
 
 
 # How much a surface mirrors at grazing incidence is unknown: it moves the edge by less than this [px].

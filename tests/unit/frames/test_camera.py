@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 
-K = [[900.0, 0, 639.5], [0, 905.0, 359.5], [0, 0, 1]]
+K = [[900.0, 0.0, 639.5], [0.0, 905.0, 359.5], [0.0, 0.0, 1.0]]
 
 
 @pytest.mark.parametrize(

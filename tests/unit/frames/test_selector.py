@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.selector import Decision, FrameSelector
-from pipeprog_frames.tracker import Tracker, reduction
+from pipeprog_frames.tracker import Tracker, is_cut_off, reduction
 
 WIDTH, HEIGHT = 320, 180
 CAMERA = Camera(WIDTH * 4, HEIGHT * 4, 900.0, 900.0, WIDTH * 2.0, HEIGHT * 2.0)
@@ -94,3 +94,11 @@ def test_stamps_that_run_backwards_or_repeat(wall: NDArray[np.uint8]) -> None:
 )
 def test_reduction(width: int, factor: int) -> None:
     assert reduction(width) == factor
+
+
+def test_a_jpeg_without_its_end_is_damaged(wall: NDArray[np.uint8]) -> None:
+    whole = cv2.imencode(".jpg", pan(wall, 0))[1].tobytes()
+    assert not is_cut_off(whole)
+    assert not is_cut_off(cv2.imencode(".png", pan(wall, 0))[1].tobytes())
+    assert is_cut_off(whole[: len(whole) // 2])
+    assert is_cut_off(b"")

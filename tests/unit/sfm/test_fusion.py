@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig
 from pipeprog_sfm.fusion import Fusion, fuse
 from pipeprog_sfm.stereo import DepthMap

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipeprog_frames.camera import Camera
+from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import StereoConfig
 from pipeprog_sfm.stereo import StereoImage, choose_pairs, depth_map
 
