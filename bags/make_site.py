@@ -108,7 +108,11 @@ def make_site(
 
     rng = np.random.default_rng(seed)
     build = build_lab if layout == Layout.lab else build_field
-    site = build(rng, richness, tiled, distance)
+    try:
+        site = build(rng, richness, tiled, distance)
+    except RuntimeError as error:
+        console.print(f"error: {error}")
+        raise typer.Exit(1) from None
     scene = build_scene(site.primitives, site.lamps, site.ambient, seed)
     walk = Walk(site.waypoints, speed, rng, site.closed_walk, wobble)
     if seconds is None:
@@ -135,7 +139,7 @@ def make_site(
     frames = _frames(scene, lens, walk, sensor, times, seed, jobs)
     shown = track(frames, total=len(times), description=out.name, console=console)
     write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown)
-    write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses))
+    write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, [c.share for c in seen]))
     write_bill(Path(f"{stem}.boq.yaml"), site)
     write_boards(Path(f"{stem}.board.yaml"), site)
     if surface:

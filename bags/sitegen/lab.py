@@ -74,7 +74,7 @@ def build_lab(rng: np.random.Generator, richness: float, wall_period: float, dis
             site.clamp(pipe, share * length, (0, 1, 0), -y)
 
     centre = left + rng.uniform(0.4, 1.0)
-    site.board((centre, 0.0, rng.uniform(2.02, 2.10) + 0.05), (0, -1, 0))
+    site.board((centre, 0.0, rng.uniform(2.07, 2.15)), (0, -1, 0))
     site.box((left - 0.1, -0.24, 2.50), (_WIDTH - 0.2, -0.03, 2.72), GALVANISED)
 
     lamp = rng.uniform(-0.4, 0.4)
@@ -84,18 +84,21 @@ def build_lab(rng: np.random.Generator, richness: float, wall_period: float, dis
     site.gain = 0.75
 
     y, right = -distance, max(left + 1.1, 2.4)
-    high, low = 1.62, 1.00
+    high, low = 1.60, 0.86
     turn = math.radians(9.0)
-    site.waypoints = [
+    lap = [
         [0.45, y, high, 0.0, 0.03],
         [1.1, y - 0.06, high + 0.03, -turn, 0.05],
         [1.8, y, high, 0.0, 0.06],
         [right, y - 0.04, high - 0.02, turn, 0.03],
         [right + 0.25, y, (high + low) / 2, turn, 0.0],
-        [right - 0.05, y + 0.04, low, turn, 0.0],
-        [1.7, y - 0.06, low - 0.05, -turn / 2, -0.02],
-        [0.95, y, low, -turn, 0.02],
+        [right - 0.05, y + 0.04, low, turn, -0.05],
+        [1.7, y - 0.06, low - 0.03, -turn / 2, -0.06],
+        [0.95, y, low, -turn, -0.05],
         [0.35, y - 0.05, (high + low) / 2, -turn, 0.0],
     ]
+    # Nobody walks the same line twice.
+    again = [[x + 0.15, y - 0.12, z + 0.07, yaw, pitch] for x, y, z, yaw, pitch in lap]
+    site.waypoints = [*lap, *again]
     site.closed_walk = True
     return site

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,8 +66,11 @@ def write_bag(path: Path, info: dict[str, Any], frames: Iterable[tuple[int, byte
     part.replace(path)
 
 
-def truth(site: Site, lens: Lens, fps: float, poses: FloatArray) -> dict[str, Any]:
-    """What is true of a recording, as plain values; (N, 4, 4) poses at the middle of each exposure."""
+def truth(site: Site, lens: Lens, fps: float, poses: FloatArray, seen: Sequence[float]) -> dict[str, Any]:
+    """What is true of a recording, as plain values; (N, 4, 4) poses at the middle of each exposure.
+
+    `seen` is the share of each pipe's length that at least three frames show.
+    """
     return {
         "width": lens.width,
         "height": lens.height,
@@ -87,8 +90,9 @@ def truth(site: Site, lens: Lens, fps: float, poses: FloatArray) -> dict[str, An
                 "length": pipe.length,
                 "material": pipe.material,
                 "ends": list(pipe.ends),
+                "seen": round(share, 3),
             }
-            for index, pipe in enumerate(site.pipes)
+            for index, (pipe, share) in enumerate(zip(site.pipes, seen, strict=True))
         ],
         "ignore": [{"start": a.tolist(), "end": b.tolist(), "radius": r} for a, b, r in site.ignored],
         "boards": [board.tolist() for board in site.boards],

@@ -78,7 +78,7 @@ def build_scene(primitives: Sequence[Primitive], lamps: Sequence[Lamp], ambient:
         np.array([m.row() for m in materials]),
         np.array([1000 * seed + 7919 * k for k in range(len(primitives))], np.int64) % 2**31,
         np.array([p.pipe for p in primitives], np.int64),
-        np.array([[*lamp.position, lamp.power] for lamp in lamps]),
+        np.array([[*lamp.position, lamp.power] for lamp in lamps], float).reshape(-1, 4),
         ambient,
     )
 
