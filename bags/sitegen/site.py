@@ -43,21 +43,18 @@ CABLE = Material("cable", (0.10, 0.10, 0.11), mottle=0.4, cell=0.05, octaves=5, 
 CARDBOARD = Material("cardboard", (0.42, 0.30, 0.18), mottle=0.35, cell=0.1, octaves=6, speckle=0.4)
 BLACK = Material("board", (0.025, 0.025, 0.027), mottle=0.05, speckle=0.0)
 WHITE = Material("circle", (0.75, 0.75, 0.74), mottle=0.01, speckle=0.0)
+# Pipes come smoother than walls: what clings to them is dust, scratches and drops of mortar.
+_PAINT = Material(
+    "paint", (0.10, 0.34, 0.16), 0.22, 0.10, 6, speckle=0.32, speckle_cell=0.025, specular=0.06, shininess=40.0
+)
+_PVC = Material("pvc", (0.66, 0.66, 0.63), 0.12, 0.12, 6, speckle=0.28, speckle_cell=0.02, specular=0.05)
 PIPE_MATERIALS = (
-    Material(
-        "steel", (0.24, 0.23, 0.22), mottle=0.45, cell=0.08, octaves=6, stretch=3.0, specular=0.20, shininess=30.0
-    ),
-    Material(
-        "paint", (0.10, 0.34, 0.16), mottle=0.30, cell=0.12, octaves=6, speckle=0.5, specular=0.06, shininess=40.0
-    ),
-    Material(
-        "paint", (0.06, 0.17, 0.40), mottle=0.30, cell=0.12, octaves=6, speckle=0.5, specular=0.06, shininess=40.0
-    ),
-    Material(
-        "paint", (0.45, 0.09, 0.06), mottle=0.30, cell=0.12, octaves=6, speckle=0.5, specular=0.06, shininess=40.0
-    ),
-    Material("pvc", (0.52, 0.52, 0.50), mottle=0.22, cell=0.15, octaves=6, speckle=0.45, specular=0.05, shininess=25.0),
-    Material("pvc", (0.55, 0.28, 0.08), mottle=0.22, cell=0.15, octaves=6, speckle=0.45, specular=0.05, shininess=25.0),
+    Material("steel", (0.20, 0.19, 0.19), 0.40, 0.08, 6, speckle=0.25, stretch=3.0, specular=0.20, shininess=30.0),
+    _PAINT,
+    replace(_PAINT, colour=(0.06, 0.17, 0.40)),
+    replace(_PAINT, colour=(0.45, 0.09, 0.06)),
+    _PVC,
+    replace(_PVC, colour=(0.55, 0.28, 0.08)),
 )
 COPPER = Material(
     "copper", (0.46, 0.20, 0.10), mottle=0.45, cell=0.04, octaves=5, stretch=4.0, specular=0.25, shininess=35.0
