@@ -11,6 +11,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect import background, classify, hypotheses, normals, octree
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.hypotheses import Hypothesis
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.refinement import Jury, Measured
@@ -90,8 +91,8 @@ def find_candidates(
     free = np.ones(len(tree.points), bool)
     accepted: list[Candidate] = []
 
-    def consider(initial: Cylinder | None) -> None:
-        candidate = measure(tree, free, initial, sigma) if initial is not None else None
+    def consider(hypothesis: Hypothesis) -> None:
+        candidate = measure(tree, free, hypothesis, sigma)
         if candidate is None:
             return
         if is_pipe(candidate, sigma, config) or (
@@ -107,15 +108,17 @@ def find_candidates(
         rest = tree.subset(free)
         fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
         shape = normals.surfaces(fine, rest.thinned(rest.level_of(scale)), scale, sigma)
-        for initial, _ in hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range)):
-            consider(initial)
+        for hypothesis in hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range)):
+            consider(hypothesis)
     report(0.7, "looking for thin pipes")
     thin = [planned for planned in planned_radii if planned < _THICKEST_LINE] or [0.5 * _THICKEST_LINE]
     rest = tree.subset(free)
     fine = rest.thinned(rest.level_of(_LINE_SCALE / _POINTS_PER_SCALE))
     shape = normals.surfaces(fine, rest.thinned(rest.level_of(0.5 * _LINE_SCALE)), _LINE_SCALE, sigma)
-    for line, _ in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
-        consider(thin_start(tree, free, line, 1.2 * sigma, thin))
+    for line in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
+        initial = thin_start(tree, free, line.cylinder, 1.2 * sigma, thin)
+        if initial is not None:
+            consider(Hypothesis(initial, line.votes))
     report(0.8, "measuring")
     # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate.
     return [
@@ -145,7 +148,7 @@ def _settled(
             reach = 1.5 * cylinder.radius + 6.0 * band
             others = [accepted[k].cylinder for k in range(len(accepted)) if k not in pieces]
             others = [other for other in others if near(other, cylinder, reach)]
-            if len(pieces) == 1 and not others:
+            if turn > 0 and len(pieces) == 1 and not others:
                 settled.append(accepted[best])
                 continue
             rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
@@ -166,10 +169,11 @@ def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig, roughness:
     # The smaller the arc, the more surfaces that are no pipe fit it: its length has to make up for that.
     slender = 3.0 if evidence.arc > np.radians(80.0) else 6.0
     # A thin pipe stands clear of what is behind it and shows its half; a strip of a surface does not.
-    vague = candidate.radius_sigma > 0.05 * cylinder.radius
+    vague = candidate.radius_sigma > 0.05 * cylinder.radius or cylinder.radius < _THICKEST_LINE
     return (
         cylinder.length >= max(slender * cylinder.radius, config.length_min)
-        and evidence.arc >= np.radians(max(config.arc_min_deg, 100.0) if vague else config.arc_min_deg)
+        and candidate.radius_sigma < 0.15 * cylinder.radius
+        and evidence.arc >= np.radians(max(config.arc_min_deg, 90.0) if vague else config.arc_min_deg)
         and evidence.coverage > 0.4
         and evidence.inside < 0.15
         and evidence.noise < roughness * (1.6 * sigma + 8e-4)

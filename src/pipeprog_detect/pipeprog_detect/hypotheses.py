@@ -22,10 +22,31 @@ _LEAST_VOTES = 4
 
 
 @dataclass(frozen=True)
+class Sector:
+    """The part of a pipe's circumference within `half` [rad] of the direction `front` (3,) from its axis."""
+
+    front: FloatArray
+    half: float
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A cylinder that `votes` votes agree on, and the sector that their patches lie in, None where that is unknown."""
+
+    cylinder: Cylinder
+    votes: int
+    sector: Sector | None = None
+
+
+@dataclass(frozen=True)
 class Votes:
-    """Points on axes (V, 3) [m], axis directions (V, 3), radii (V,) [m], and the scale [m] they were seen at."""
+    """Points on axes (V, 3) and on the surface (V, 3), axis directions (V, 3), radii (V,), scale of the patches; [m].
+
+    Lines of points vote without a surface: their feet are the points on the axis.
+    """
 
     points: FloatArray
+    feet: FloatArray
     directions: FloatArray
     radii: FloatArray
     scale: float
@@ -43,7 +64,7 @@ def votes_of(shape: Surfaces, sigma: float, radius_range: tuple[float, float]) -
     good &= np.abs(shape.second) < np.maximum(0.35 * bend, 2.0 * shape.sigma)
     good &= (shape.rms < 2.0 * sigma + 5e-4) & (shape.inliers > 0.75)
     centres = shape.feet[good] - shape.normals[good] / shape.curvature[good][:, None]
-    return Votes(centres, shape.directions[good], 1.0 / bend[good], shape.scale)
+    return Votes(centres, shape.feet[good], shape.directions[good], 1.0 / bend[good], shape.scale)
 
 
 def line_votes(shape: Surfaces, sigma: float, thickest: float) -> Votes:
@@ -55,11 +76,11 @@ def line_votes(shape: Surfaces, sigma: float, thickest: float) -> Votes:
     good = (shape.count > 0) & (shape.spread[:, 2] > 0.45 * shape.scale)
     good &= (shape.spread[:, 1] < across) & (shape.spread[:, 1] < 0.5 * shape.spread[:, 2])
     radii = np.full(int(good.sum()), thickest)
-    return Votes(shape.centres[good], shape.line[good], radii, shape.scale)
+    return Votes(shape.centres[good], shape.centres[good], shape.line[good], radii, shape.scale)
 
 
-def consensus(votes: Votes) -> list[tuple[Cylinder, int]]:
-    """Hypotheses, best supported first: each a cylinder through collinear votes, and how many they are.
+def consensus(votes: Votes) -> list[Hypothesis]:
+    """Hypotheses, best supported first: each a cylinder through collinear votes.
 
     Starts at the vote with the most alike ones around it, grows along the line while refitting it, removes its
     votes, goes on with the rest.
@@ -68,12 +89,13 @@ def consensus(votes: Votes) -> list[tuple[Cylinder, int]]:
         return []
     tree = octree.build(votes.points)
     points, directions, radii = tree.points, votes.directions[tree.order], votes.radii[tree.order]
+    feet = votes.feet[tree.order]
     around = 2.0 * votes.scale
     level = tree.level_of(around) + 1
     cells = tree.cells(level)
     local = _local_support(points, directions, radii, tree.keys >> (3 * level), cells.keys, cells.starts, level, around)
     alive = np.ones(len(points), bool)
-    found: list[tuple[Cylinder, int]] = []
+    found: list[Hypothesis] = []
     for start in np.argsort(-local, kind="stable"):
         if local[start] < _LEAST_VOTES:
             break
@@ -100,8 +122,30 @@ def consensus(votes: Votes) -> list[tuple[Cylinder, int]]:
         alive[members] = False
         along = (points[members] - centre) @ direction
         ends = centre + np.array([along.min() - votes.scale, along.max() + votes.scale])[:, None] * direction
-        found.append((Cylinder(ends[0], ends[1], radius), len(members)))
-    return sorted(found, key=lambda item: -item[1])
+        cylinder = Cylinder(ends[0], ends[1], radius)
+        found.append(Hypothesis(cylinder, len(members), _sector(feet[members], cylinder)))
+    return sorted(found, key=lambda hypothesis: -hypothesis.votes)
+
+
+def _sector(feet: FloatArray, cylinder: Cylinder) -> Sector | None:
+    """Where the patches lie around the axis: nine tenths of them and some of their width, 50 deg either side at least.
+
+    A patch that reaches into the cleft between two pipes fits no quadric and has no vote, so this sector is clear of
+    neighbours: a touching one of the same size begins at 60 deg.
+    """
+    offset = feet - cylinder.start
+    radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+    distance = np.linalg.norm(radial, axis=1)
+    if np.median(distance) < 0.5 * cylinder.radius:
+        return None
+    radial /= np.maximum(distance, 1e-9)[:, None]
+    front = radial.mean(axis=0)
+    length = float(np.linalg.norm(front))
+    if length < 0.3:
+        return None
+    front /= length
+    half = np.quantile(np.arccos(np.clip(radial @ front, -1.0, 1.0)), 0.9)
+    return Sector(front, max(float(half) + np.radians(10.0), np.radians(50.0)))
 
 
 def _direction(points: FloatArray, directions: FloatArray, guess: FloatArray, radius: float) -> FloatArray:

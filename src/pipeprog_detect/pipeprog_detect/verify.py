@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_detect.extent import Run, straight_stretch, surface_runs
 from pipeprog_detect.fit import CylinderFit, basis, covered_arc, fit_cylinder
-from pipeprog_detect.octree import IntArray, Octree
+from pipeprog_detect.hypotheses import Hypothesis, Sector
+from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cylinder, FloatArray
 
 _FIT_POINTS = 2500
@@ -59,13 +61,14 @@ class Candidate:
         return 1.2 * self.evidence.noise + 2e-4
 
 
-def measure(tree: Octree, free: IntArray | np.ndarray, initial: Cylinder, sigma: float) -> Candidate | None:
-    """Fit `initial` to the points of the tree that are free (N,) bool, and follow it along its axis to its ends.
+def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma: float) -> Candidate | None:
+    """Fit a hypothesis to the points of the tree that are free (N,), and follow it along its axis to its ends.
 
+    Only the sector that voted for it is fitted: beside it a neighbour may begin, which is not known yet.
     sigma [m] is the cloud's typical noise; a pipe's own may be up to 1.6 times that (head-on surfaces, waviness).
     """
     wide = 1.2 * sigma + 5e-4
-    cylinder = initial
+    initial = cylinder = hypothesis.cylinder
     for turn in range(12):
         axis = cylinder.axis
         step = max(0.5 * cylinder.length, 0.25, 4.0 * cylinder.radius) if turn else 0.0
@@ -86,7 +89,8 @@ def measure(tree: Octree, free: IntArray | np.ndarray, initial: Cylinder, sigma:
             grown = max(-low, high - cylinder.length)
             cylinder = _cut(cylinder, low, high)
             points = _within(points, cylinder, Run(0.0, cylinder.length))
-        fit = fit_cylinder(_spread_out(points, _FIT_POINTS), None, cylinder, wide, reach=reach, along_ray=False)
+        facing = _spread_out(_facing(points, cylinder, hypothesis.sector), _FIT_POINTS)
+        fit = fit_cylinder(facing, None, cylinder, wide, reach=reach, along_ray=False)
         if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
             return None
         wide = float(np.clip(1.2 * fit.rmse, 0.7 * sigma + 3e-4, 1.6 * sigma + 7e-4))
@@ -95,18 +99,21 @@ def measure(tree: Octree, free: IntArray | np.ndarray, initial: Cylinder, sigma:
             break
     margin = cylinder.radius * cylinder.axis
     rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, 1.5 * cylinder.radius + 6.0 * wide)
-    return settle(tree.points[rows[free[rows]]], cylinder, wide)
+    return settle(tree.points[rows[free[rows]]], cylinder, wide, sector=hypothesis.sector)
 
 
-def settle(points: FloatArray, cylinder: Cylinder, wide: float, whole: bool = False) -> Candidate | None:
+def settle(
+    points: FloatArray, cylinder: Cylinder, wide: float, whole: bool = False, sector: Sector | None = None
+) -> Candidate | None:
     """Measure a cylinder that is nearly right on the points (N, 3) around it, all of which are its own or nobody's.
 
     Points within three times `wide` [m] are its surface. A `whole` cylinder is known to be one pipe between its ends,
     whatever the gaps; otherwise it is followed as far as it is straight and its gaps are such as a clamp explains.
+    Where a sector is given, only that is fitted.
     """
     near = points[np.abs(_signed_distance(points, cylinder)) < max(5.0 * wide, 0.2 * cylinder.radius)]
     # A cap closes the end: its points lie within the barrel all around, and would draw the radius in.
-    body = _within(near, cylinder, _without_caps(cylinder, wide))
+    body = _facing(_within(near, cylinder, _without_caps(cylinder, wide)), cylinder, sector)
     fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), None, cylinder, wide, reach=1.0)
     if fit is None:
         return None
@@ -128,7 +135,7 @@ def settle(points: FloatArray, cylinder: Cylinder, wide: float, whole: bool = Fa
 
 
 def thin_start(
-    tree: Octree, free: IntArray | np.ndarray, line: Cylinder, sigma: float, radii: Sequence[float]
+    tree: Octree, free: NDArray[np.bool_], line: Cylinder, sigma: float, radii: Sequence[float]
 ) -> Cylinder | None:
     """The cylinder, of those of the given radii about a line through the points of a thin pipe, that explains most.
 
@@ -224,6 +231,14 @@ def _roundness(points: FloatArray, cylinder: Cylinder, distance: FloatArray, sec
     own = np.var(distance) / np.maximum(count, 1)
     square = np.average(mean**2 - own, weights=count)
     return float(np.sqrt(max(square, 0.0)))
+
+
+def _facing(points: FloatArray, cylinder: Cylinder, sector: Sector | None) -> FloatArray:
+    if sector is None:
+        return points
+    offset = points - cylinder.start
+    radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+    return points[radial @ sector.front > np.cos(sector.half) * np.linalg.norm(radial, axis=1)]
 
 
 def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
