@@ -1,0 +1,224 @@
+"""The whole graph, real nodes over real DDS, on the first board of the demo recording: replayed and live."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from pipeprog_bringup import cdr
+from pipeprog_bringup.bag import Bag, Frame
+from pipeprog_bringup.bag_writer import BagWriter
+from pipeprog_node import messages, qos
+
+BAGS = Path(__file__).parents[2] / "bags"
+BAG, BOQ, BOARD = (BAGS / f"demo.{end}" for end in ("mcap", "boq.yaml", "board.yaml"))
+BOARD_SEEN = slice(3, 19)  # frames from the first that shows the whole board
+NO_BOARD_SEEN = slice(16, 24)
+COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # the graph is tested here, not its accuracy
+TIMEOUT = 120.0  # s, for whatever takes seconds on an idle machine
+MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"}
+
+
+def cut(path: Path, part: slice) -> Path:
+    with path.open("wb") as stream, BagWriter(stream) as writer:
+        for frame in list(Bag.open(BAG))[part]:
+            writer.write("/camera/camera_info", cdr.CAMERA_INFO, frame.camera_info, frame.stamp)
+            writer.write("/camera/image/compressed", cdr.COMPRESSED_IMAGE, frame.data, frame.stamp)
+    return path
+
+
+def start_replay(bag: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+    """The installed command; without ROS_DOMAIN_ID it takes a domain of its own, so that two can run at a time."""
+    settings = [word for name, value in COARSE.items() for word in ("--set", f"sfm.{name}={value}")]
+    return subprocess.Popen(
+        [Path(sys.executable).parent / "pipeprog", "replay", bag, "--boq", BOQ, "--out", out, *settings, *options],
+        env={name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> None:
+    bag = cut(tmp_path / "cut.mcap", BOARD_SEEN)
+    replays = [start_replay(bag, tmp_path / name, "--board", str(BOARD)) for name in ("one", "two")]
+    for replay in replays:
+        _, errors = replay.communicate(timeout=TIMEOUT)
+        assert replay.returncode == 0, errors
+    one, two = tmp_path / "one", tmp_path / "two"
+    for name in ("pipes.json", "cloud.ply"):
+        assert (one / name).read_bytes() == (two / name).read_bytes(), name
+
+    assert sorted(file.name for file in one.iterdir()) == [
+        *("cloud.ply", "config.yaml", "frames.csv", "out.mcap", "pipes.json", "progress.csv", "run.json"),
+        "trajectory.tum",
+    ]
+    with (one / "frames.csv").open() as stream:
+        considered = [int(row["stamp"]) for row in csv.DictReader(stream)]
+    assert considered == [frame.stamp for frame in Bag.open(bag)]
+    assert len(considered) == 16
+
+    result = json.loads((one / "pipes.json").read_text())
+    assert result.keys() == {"frame_id", "scale", "pipes", "classes"}
+    assert result["frame_id"] == "map"
+    assert result["scale"]["source"] == "board"
+    assert 0 < result["scale"]["sigma"] < 0.01
+    for pipe in result["pipes"]:
+        assert pipe.keys() == {
+            *("id", "start", "end", "radius", "radius_sigma", "length"),
+            *("class", "class_probability", "visible_arc_deg", "rmse", "points"),
+        }
+        # Each coordinate and the length are rounded to the micrometre.
+        assert pipe["length"] == pytest.approx(np.linalg.norm(np.subtract(pipe["end"], pipe["start"])), abs=3e-6)
+    planned = {entry["name"]: entry["outer_radius_mm"] / 1000 for entry in yaml.safe_load(BOQ.read_text())["classes"]}
+    assert {entry["class"]: entry["outer_radius"] for entry in result["classes"]} == planned
+    classified = [pipe for pipe in result["pipes"] if pipe["class"] is not None]
+    assert any(abs(pipe["radius"] - planned[pipe["class"]]) < 0.001 for pipe in classified), result["pipes"]
+
+
+@pytest.mark.parametrize(
+    ("part", "options"), [(NO_BOARD_SEEN, ["--board", str(BOARD)]), (BOARD_SEEN, [])], ids=["out of view", "not given"]
+)
+def test_without_a_board_the_reason_is_told_and_nothing_written(
+    tmp_path: Path, part: slice, options: list[str]
+) -> None:
+    replay = start_replay(cut(tmp_path / "cut.mcap", part), tmp_path / "out", *options)
+    _, errors = replay.communicate(timeout=TIMEOUT)
+    assert replay.returncode == 1
+    assert "board" in errors
+    assert "Traceback" not in errors
+    assert [file.name for file in tmp_path.iterdir()] == ["cut.mcap"]
+
+
+class Robot:
+    """Publishes images as a camera does, and notes what the graph says."""
+
+    def __init__(self) -> None:
+        self.node = Node("robot")
+        self.maps: list[PointCloud2] = []
+        self.markers: list[MarkerArray] = []
+        self.heard: dict[str, list[float]] = defaultdict(list)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._images = self.node.create_publisher(CompressedImage, "image/compressed", qos.reliable(10))
+        self._infos = self.node.create_publisher(CameraInfo, "camera_info", qos.reliable(10))
+        self.node.create_subscription(PointCloud2, "map_points", self.maps.append, qos.latched())
+        self.node.create_subscription(MarkerArray, "pipe_markers", self.markers.append, qos.latched())
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def wait_for(self, condition: Callable[[], object], seconds: float = TIMEOUT) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, "waited in vain"
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def is_connected(self) -> bool:
+        count = self.node.count_subscribers
+        wanted = {"image/compressed": 1, "camera_info": 1, "map_points": 2, "keyframe_poses": 1, "sfm_status": 1}
+        wanted |= {"keyframes/image/compressed": 2, "keyframes/camera_info": 2, "image_overlap": 1}
+        return len(self.heard) == len(MODULES) and all(count(topic) >= number for topic, number in wanted.items())
+
+    def walk(self, frames: list[Frame]) -> None:
+        """Ten frames a second."""
+        for frame in frames:
+            due = time.monotonic() + 0.1
+            info = deserialize_message(frame.camera_info, CameraInfo)
+            info.header = messages.header(frame.stamp, frame.frame_id)
+            self._infos.publish(info)
+            self._images.publish(frame.data)
+            self.wait_for(lambda due=due: time.monotonic() >= due)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.heard[status.name.partition(":")[0]].append(time.monotonic())
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    rclpy.init()
+    robot = Robot()
+    yield robot
+    robot.node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.fixture
+def nodes(tmp_path: Path) -> Iterator[dict[str, subprocess.Popen[bytes]]]:
+    parameters = {
+        "frames": {"lockstep": False},
+        "sfm": {"board": str(BOARD), "map_interval": 4, **COARSE},
+        "detect": {"boq": str(BOQ)},
+    }
+    started = {}
+    for name, module in MODULES.items():
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(yaml.safe_dump({name: {"ros__parameters": parameters[name]}}))
+        command = [sys.executable, "-m", module, "--ros-args", "-r", f"__node:={name}", "--params-file", str(file)]
+        started[name] = subprocess.Popen(command)
+    yield started
+    for process in started.values():
+        process.kill()  # the kernel ends its worker with it
+        process.wait()
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
+
+
+def test_a_live_graph_maps_while_the_robot_walks(robot: Robot, nodes: dict[str, subprocess.Popen[bytes]]) -> None:
+    robot.wait_for(robot.is_connected)
+    frames = list(Bag.open(BAG))
+    robot.walk(frames[:14])
+    robot.wait_for(lambda: robot.maps and robot.markers)
+    robot.walk(frames[14:28])
+    robot.wait_for(lambda: len(robot.maps) > 1)
+
+    assert robot.maps[-1].width > robot.maps[0].width > 0
+    assert all(cloud.header.frame_id == "map" for cloud in robot.maps)
+    for array in robot.markers:
+        assert array.markers[0].action == Marker.DELETEALL
+        for marker in array.markers:
+            assert marker.header.frame_id == "map"
+            assert marker.lifetime.sec == marker.lifetime.nanosec == 0
+    assert any(marker.action == Marker.ADD for array in robot.markers for marker in array.markers)
+
+    # Diagnostics come once a second, at work as at rest: no callback waits for the computing.
+    assert robot.heard.keys() == nodes.keys()
+    for name, heard in robot.heard.items():
+        gaps = np.diff([*heard, time.monotonic()])
+        assert gaps.max() < 3.0, name
+        assert np.median(gaps[:-1]) == pytest.approx(1.0, abs=0.2), name
+
+    workers = {name: children(process.pid) for name, process in nodes.items()}
+    assert workers["sfm"]
+    assert workers["detect"]
+    for process in nodes.values():
+        process.send_signal(signal.SIGINT)
+    assert {name: process.wait(timeout=TIMEOUT) for name, process in nodes.items()} == dict.fromkeys(nodes, 0)
+    robot.wait_for(lambda: not any(is_running(pid) for pids in workers.values() for pid in pids), 5.0)
