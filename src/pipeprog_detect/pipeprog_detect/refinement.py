@@ -75,7 +75,9 @@ class Jury:
             fit = self._refined(candidate, others, self._views)
             if fit is None and not (trusted[number] and (not self.sits or _resolved(candidate))):
                 continue
-            if fit is not None and not trusted[number] and not self._is_planned(fit):
+            # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate or a corner.
+            doubtful = self.sits and (candidate.blurred or not trusted[number])
+            if fit is not None and doubtful and not self._is_planned(fit):
                 continue
             measured = (
                 Measured(candidate, candidate.cylinder, candidate.radius_sigma)
