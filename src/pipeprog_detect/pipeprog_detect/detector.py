@@ -126,7 +126,7 @@ def find_candidates(
         for candidate in _settled(tree, accepted, sigma, config, jury)
         if jury.sits
         or not candidate.blurred
-        or any(abs(candidate.cylinder.radius - radius) < 3.0 * candidate.radius_sigma for radius in planned_radii)
+        or any(abs(candidate.cylinder.radius - radius) < 4.0 * candidate.radius_sigma for radius in planned_radii)
     ]
 
 

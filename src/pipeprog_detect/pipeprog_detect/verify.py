@@ -197,8 +197,8 @@ def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: fl
     again = fit_cylinder(
         _spread_out(points, _FINAL_POINTS), None, replace(cylinder, radius=radius), wide, reach=1.0, fixed_radius=radius
     )
-    # The share of the noise across is known to a third of it, the variance of the seen part to a seventh.
-    sigma = float(np.hypot(0.07 * radius, 1.5 * 0.5 * noise**2 / radius))
+    # The share of the noise across is known to a third of it; a part hidden takes up to a fifth off the width.
+    sigma = float(np.hypot(0.1 * radius, 1.5 * 0.5 * noise**2 / radius))
     return (again or fit), sigma
 
 
