@@ -17,7 +17,7 @@ from sitegen.textures import relief
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
-_EDGE_SAMPLES = 16
+_EDGE_BITS = 4  # sixteen rays
 _BORE = 0.9  # inner over outer radius, as the end of a pipe shows it
 
 
@@ -83,10 +83,10 @@ def build_scene(primitives: Sequence[Primitive], lamps: Sequence[Lamp], ambient:
     )
 
 
-def _edge_pattern() -> FloatArray:
-    """(16, 2) offsets in a pixel, all columns and rows distinct, so that no edge direction is quantised coarsely."""
-    bits = np.array([int(f"{i:04b}"[::-1], 2) for i in range(_EDGE_SAMPLES)])
-    return np.c_[(np.arange(_EDGE_SAMPLES) + 0.5), bits + 0.5] / _EDGE_SAMPLES - 0.5
+def _edge_pattern(bits: int) -> FloatArray:
+    """(2**bits, 2) offsets in a pixel, all columns and rows distinct, so that edges are not quantised coarsely."""
+    reversed_ = np.array([int(f"{i:0{bits}b}"[::-1], 2) for i in range(2**bits)])
+    return np.c_[np.arange(2**bits) + 0.5, reversed_ + 0.5] / 2**bits - 0.5
 
 
 @njit(nogil=True)
@@ -244,8 +244,11 @@ def _trace(
                 points[r, c, 2] = pose[2, 3] + hit[0] * dz
 
 
-def render(scene: Scene, lens: Lens, row_poses: FloatArray) -> FloatImage:
-    """Linear RGB image (H, W, 3) float32, unclipped; `row_poses` (H, 4, 4) are world_from_camera for each row."""
+def render(scene: Scene, lens: Lens, row_poses: FloatArray, edge_bits: int = _EDGE_BITS) -> FloatImage:
+    """Linear RGB image (H, W, 3) float32, unclipped; `row_poses` (H, 4, 4) are world_from_camera for each row.
+
+    Pixels on an edge take 2**edge_bits rays.
+    """
     image = np.empty((lens.height, lens.width, 3), np.float32)
     labels = np.empty((lens.height, lens.width), np.int64)
     _render(
@@ -256,7 +259,7 @@ def render(scene: Scene, lens: Lens, row_poses: FloatArray) -> FloatImage:
         scene.ambient,
         np.ascontiguousarray(row_poses[:, :3]),
         lens.row(),
-        _edge_pattern(),
+        _edge_pattern(edge_bits),
         image,
         labels,
     )
