@@ -10,9 +10,9 @@ from sitegen.sensor import Sensor, develop
 from sitegen.walk import look
 
 LENS = Lens(640, 480, 457.0, 457.0, 319.5, 239.5)
-FLAT = {"mottle": 0.0, "speckle": 0.0}
-DARK = Material("dark", (0.05, 0.05, 0.05), **FLAT)
-LIGHT = Material("light", (0.7, 0.7, 0.7), **FLAT)
+
+DARK = Material("dark", (0.05, 0.05, 0.05), mottle=0.0, speckle=0.0)
+LIGHT = Material("light", (0.7, 0.7, 0.7), mottle=0.0, speckle=0.0)
 CENTRE_TOLERANCE = 0.02  # pixels, noise-free
 EDGE_TOLERANCE = 0.03  # pixels, noise-free: half a step of the sixteen sub-columns
 

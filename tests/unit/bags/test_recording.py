@@ -51,7 +51,9 @@ def test_images_and_calibration_come_in_pairs(recording: Path) -> None:
     assert np.diff([s for s, _ in images]).tolist() == [200_000_000]
     for _, image in images:
         assert image.format == "jpeg"
-        assert cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR).shape == (480, 854, 3)
+        decoded = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+        assert decoded is not None
+        assert decoded.shape == (480, 854, 3)
 
 
 def test_calibration_agrees_with_the_truth_but_for_the_error_asked_for(recording: Path) -> None:
