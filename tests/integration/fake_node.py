@@ -59,7 +59,7 @@ class FakeNode(Node):
         self._undecided: list[CompressedImage] = []
 
     def _be_sfm(self) -> None:
-        self._overlaps = self.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.reliable(50))
+        self._overlaps = self.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.kept(50))
         self._points = self.create_publisher(PointCloud2, "map_points", qos.latched())
         self._poses = self.create_publisher(PathMsg, "keyframe_poses", qos.latched())
         self._statuses = self.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())

@@ -221,7 +221,7 @@ class _Run:
         self._images = node.create_publisher(image_type, image_topic, qos.reliable(4 * IN_FLIGHT))
         self._infos = node.create_publisher(CameraInfo, "camera_info", qos.reliable(4 * IN_FLIGHT))
         node.create_subscription(msg.FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
-        node.create_subscription(msg.ImageOverlapArray, "image_overlap", self._on_overlap, qos.reliable(1000))
+        node.create_subscription(msg.ImageOverlapArray, "image_overlap", self._on_overlap, qos.kept(1000))
         node.create_subscription(msg.SfmStatus, "sfm_status", self._on_status, qos.latched())
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self._services = {

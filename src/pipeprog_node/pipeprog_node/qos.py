@@ -23,8 +23,13 @@ def reliable(depth: int) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=QoSReliabilityPolicy.RELIABLE)
 
 
+def kept(depth: int) -> QoSProfile:
+    """As `reliable`, and those who find the publisher late still get its last messages."""
+    return QoSProfile(
+        depth=depth, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+    )
+
+
 def latched() -> QoSProfile:
     """States of which only the newest counts, also for those who subscribe later: map, pipes, markers."""
-    return QoSProfile(
-        depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
-    )
+    return kept(1)

@@ -47,7 +47,7 @@ class SfmNode(Node):
         self._finish: tuple[int, Future] | None = None
         self._finish_sent = False
 
-        self._overlap = self.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.reliable(50))
+        self._overlap = self.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.kept(50))
         self._points = self.create_publisher(PointCloud2, "map_points", qos.latched())
         self._poses = self.create_publisher(Path, "keyframe_poses", qos.latched())
         self._statuses = self.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
