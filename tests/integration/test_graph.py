@@ -194,6 +194,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
+@pytest.mark.flaky(reruns=2)  # live images are best effort: a busy machine may lose those that the second map needs
 def test_a_live_graph_maps_while_the_robot_walks(robot: Robot, nodes: dict[str, subprocess.Popen[bytes]]) -> None:
     robot.wait_for(robot.is_connected)
     frames = list(Bag.open(BAG))
