@@ -47,6 +47,8 @@ def detect(
     the share done (0..1) and what is being done.
     """
     report = progress or _silent
+    if config.front_end != "normals":
+        raise InputError(f"the front end '{config.front_end}' is not built yet: use front_end=normals")
     points = np.asarray(cloud.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"the cloud's points have the shape {points.shape}: give N x 3 metres")
