@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ PRIOR_CENTRE = 0.03
 PRIOR_POSE = 0.1
 PRIOR_WEIGHT = 4.0
 
+PARTNERS = 6  # images that each image is paired with, near to far, to place a board
 CAUCHY = 2.385  # 95 % efficiency for normal errors
 CAUCHY_SQUARE = 0.630  # mean of weight times squared residual, of normal errors in two dimensions, over that without
 LARGEST_SIGMA = 0.01  # relative; a scale known worse than that is not published
@@ -242,8 +244,10 @@ def _consensus(
     best, best_score = np.eye(4), (0, 0.0)
     best_inliers: NDArray[np.bool_] = np.zeros((len(orders), len(views)), bool)
     for first in np.unique(np.linspace(0, len(views) - 1, 40).astype(int)):
-        partner = int(np.linalg.norm(centres - centres[first], axis=1).argmax())
-        for order in orders:
+        # The far ones triangulate best, but may see an equal board elsewhere: the near ones see the same.
+        by_distance = np.argsort(np.linalg.norm(centres - centres[first], axis=1), kind="stable")[1:]
+        partners = by_distance[np.unique(np.linspace(0, len(by_distance) - 1, PARTNERS).astype(int))]
+        for partner, order in product(partners.tolist(), orders):
             start = _from_pair(rows, int(first), partner, order, camera, board)
             if start is None:
                 continue

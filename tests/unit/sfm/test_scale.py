@@ -126,6 +126,17 @@ def test_boards_of_one_layout_are_told_apart_by_place():
     assert np.linalg.norm(gap) * estimate.scale == pytest.approx(0.8, abs=0.001)
 
 
+def test_equal_boards_at_both_ends_of_a_walk_are_told_apart():
+    left, right = np.eye(4), np.eye(4)
+    left[0, 3], right[0, 3] = -3.0, 3.0
+    walk = Walk(
+        5, views=24, noise=0.03, pose_noise=0.0003, span=7.0, follow=1.0, boards=((BOARD, left), (BOARD, right))
+    )
+    estimate = walk.estimate((BOARD, replace(BOARD, name="twin")))
+    assert sorted(one.board for one in estimate.placements) == ["A", "twin"]
+    assert estimate.scale * walk.factor == pytest.approx(1.0, abs=5e-4)
+
+
 def test_an_image_with_a_wrong_pose_does_no_harm():
     walk = Walk(6, views=10, noise=0.03, pose_noise=0.0003)
     walk.poses[4][:3, 3] += 0.09 * walk.factor
