@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,12 @@ class BoardTracker:
         if found:
             self._observations[stamp] = found
         return found
+
+    def retire(self, stamps: Iterable[int]) -> None:
+        """Forgets keyframes [ns]; unknown ones are ignored."""
+        for stamp in stamps:
+            self._ellipses.pop(stamp, None)
+            self._observations.pop(stamp, None)
 
     def estimate(self, poses: Mapping[int, FloatArray]) -> ScaleEstimate:
         """Scale and map frame for (4, 4) poses camera_from_model by stamp; raises NoScaleError with the reason."""

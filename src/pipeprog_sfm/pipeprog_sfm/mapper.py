@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
@@ -66,15 +67,6 @@ class FrameTie:
 
 
 @dataclass(frozen=True)
-class SparsePoints:
-    """points_in_model (N, 3) float64, views that see each (N,) int64, mean reprojection error (N,) in px."""
-
-    points_in_model: FloatArray
-    track_length: IntArray
-    error: FloatArray
-
-
-@dataclass(frozen=True)
 class _Keyframe:
     stamp: int
     features: Features
@@ -108,8 +100,13 @@ class Mapper:
 
     @property
     def seen(self) -> int:
-        """Keyframes given so far."""
+        """Keyframes given so far, less those retired."""
         return len(self._keyframes)
+
+    @property
+    def registered(self) -> int:
+        """Keyframes of the published model."""
+        return len(self._published) if self._models else 0
 
     @property
     def waiting(self) -> int:
@@ -153,6 +150,27 @@ class Mapper:
             self._merge(stamp)
         return self._report(stamp)
 
+    def retire(self, stamps: Collection[int]) -> None:
+        """Takes keyframes back as if they had never come: pose, features and observations; unknown stamps are ignored.
+
+        A point that fewer than two others see goes with them. A view that is left alone in its model waits again.
+        """
+        for stamp in stamps:
+            if self._keyframes.pop(stamp, None) is None:
+                continue
+            self._tied.pop(stamp, None)
+            model = self._model_of(stamp)
+            if model is None:
+                self._waiting.remove(stamp)
+            else:
+                self._drop(model, model.stamps.index(stamp))
+        for model in list(self._models):
+            if len(model) < 2:
+                self._waiting += model.stamps
+                self._models.remove(model)
+            elif stamps:
+                model.filter(*model.observations(np.ones(len(model.points), bool)))
+
     def finish(self) -> None:
         """Tries the waiting keyframes once more and adjusts everything."""
         for model in self._models:
@@ -174,39 +192,12 @@ class Mapper:
         model = self._published
         return {model.stamps[view]: model.pose(view) for view in np.argsort(model.stamps, kind="stable")}
 
-    def points(self) -> SparsePoints:
-        """The published model's points."""
-        if not self._models:
-            return SparsePoints(np.empty((0, 3)), np.empty(0, np.int64), np.empty(0))
-        model = self._published
-        ids, start, features = model.observations(np.ones(len(model.points), bool))
-        length = np.diff(start)
-        error = np.add.reduceat(model.errors(features), start[:-1]) / length if len(ids) else np.empty(0)
-        return SparsePoints(model.points[ids], length, error)
-
-    def observations(self, stamp: int) -> tuple[IntArray, FloatArray]:
-        """Indices into points() and (K, 2) pixels of what a keyframe of the published model sees."""
-        model = self._published
-        alive = np.zeros(len(model.points), bool)
-        alive[model.point_of[model.point_of >= 0]] = True
-        number = np.cumsum(alive) - 1
-        own = model.point_of[model.features(model.stamps.index(stamp))]
-        seen = own >= 0
-        return number[own[seen]], self._keyframes[stamp].features.keypoints[seen].astype(np.float64)
-
     def depths(self, stamp: int) -> FloatArray:
         """(K,) depths, in the model's unit, of the points that a keyframe of the published model sees."""
         model = self._published
         view = model.stamps.index(stamp)
         own = model.point_of[model.features(view)]
         return model.points[own[own >= 0]] @ model.rotation[view, 2] + model.translation[view, 2]
-
-    def neighbours(self, stamp: int) -> list[tuple[int, int]]:
-        """(stamp, shared points) of the published model's keyframes that share points, most first."""
-        model = self._published
-        shared = model.covisible(model.stamps.index(stamp))
-        order = np.argsort(-shared, kind="stable")
-        return [(model.stamps[view], int(shared[view])) for view in order if shared[view] > 0]
 
     def ties(self) -> list[FrameTie]:
         """Overlap of the keyframes for which it changed since the last call."""
@@ -342,7 +333,7 @@ class Mapper:
         return ""
 
     def _drop(self, model: SparseModel, view: int) -> None:
-        del self._evidence[model.stamps[view]]
+        self._evidence.pop(model.stamps[view], None)  # the two that started the model have none
         model.drop(view)
 
     def _link(self, model: SparseModel, view: int) -> None:

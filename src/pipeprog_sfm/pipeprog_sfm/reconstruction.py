@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -58,8 +58,7 @@ class MetricMap:
 @dataclass(frozen=True)
 class _Depth:
     map: DepthMap
-    neighbour: int
-    baseline: float  # to that neighbour, in model units when the map was made
+    baselines: dict[int, float]  # to the neighbours that it was made with, in model units of that time
 
 
 class Reconstruction:
@@ -101,6 +100,17 @@ class Reconstruction:
         """Notes a keyframe that could not be used."""
         self._problem = f"keyframe {stamp}: {problem}"
 
+    def retire(self, stamps: Collection[int]) -> None:
+        """Takes keyframes out of the map: pose, observations and depth map; unknown stamps are ignored.
+
+        What they have added to the cloud stays until the cloud is made anew, at the latest for the final map.
+        """
+        self._mapper.retire(stamps)
+        self._targets.retire(stamps)
+        for stamp in stamps:
+            self._encoded.pop(stamp, None)
+            self._depths.pop(stamp, None)
+
     def finish(self) -> None:
         """Registers what still can be, adjusts everything and completes the depth maps."""
         self._mapper.finish()
@@ -114,11 +124,10 @@ class Reconstruction:
 
     def status(self) -> Status:
         """Health so far."""
-        registered = len(self._mapper.camera_from_model())
         message = self._problem or ("; ".join(self._scale.warnings) if self._scale else self._reason)
         return Status(
             self._mapper.seen,
-            registered,
+            self._mapper.registered,
             self._mapper.waiting,
             self._mapper.models,
             self._mapper.reprojection_error,
@@ -195,8 +204,8 @@ class Reconstruction:
         self, reference: StereoImage, neighbours: Sequence[StereoImage], depth_range: tuple[float, float]
     ) -> _Depth:
         result = depth_map(reference, neighbours, depth_range, self._config.stereo)
-        baseline = _distance(reference.camera_from_world, neighbours[0].camera_from_world)
-        return _Depth(result, neighbours[0].stamp, baseline)
+        pose = reference.camera_from_world
+        return _Depth(result, {other.stamp: _distance(pose, other.camera_from_world) for other in neighbours})
 
     def _fuse(self, poses: dict[int, FloatArray], camera_from_model: dict[int, FloatArray]) -> None:
         """Adds new depth maps to the cloud; starts over when the poses have moved by more than a voxel."""
@@ -212,10 +221,12 @@ class Reconstruction:
             if stamp in self._fused or stamp not in self._depths:
                 continue
             depth = self._depths[stamp].result()
-            if depth.neighbour not in poses:
+            left = [other for other in depth.baselines if other in poses]
+            if not left:
                 continue
-            # The model's unit drifts with every adjustment; the baseline tells by how much.
-            drift = _distance(camera_from_model[stamp], camera_from_model[depth.neighbour]) / depth.baseline
+            # The model's unit drifts with every adjustment; the baselines tell by how much.
+            now = sum(_distance(camera_from_model[stamp], camera_from_model[other]) for other in left)
+            drift = now / sum(depth.baselines[other] for other in left)
             self._fusion.add(depth.map, pose, self._scale.scale * drift)
             self._fused[stamp] = pose
 

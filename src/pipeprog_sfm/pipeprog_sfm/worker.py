@@ -24,6 +24,13 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
+class Retire:
+    """Command: take these keyframes out of the map; the next KeyframeDone tells what that has changed."""
+
+    stamps: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Finish:
     """Command: no more keyframes come; publish the final map."""
 
@@ -69,6 +76,8 @@ def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board]) ->
             if since_map >= config.map_interval and not connection.poll():
                 since_map = 0
                 _send_map(connection, reconstruction)
+        elif isinstance(command, Retire):
+            reconstruction.retire(command.stamps)
         else:
             reconstruction.finish()
             problem = _send_map(connection, reconstruction)

@@ -110,29 +110,6 @@ def test_every_keyframe_is_registered_where_it_was(straight: tuple[Mapper, dict[
     assert 0.25 < mapper.reprojection_error < 0.45
 
 
-def test_points_and_observations_agree_with_the_poses(straight: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
-    mapper, _ = straight
-    points = mapper.points()
-    assert points.points_in_model.shape == (len(points.track_length), 3)
-    assert points.track_length.min() >= 2
-    stamp, camera_from_model = list(mapper.camera_from_model().items())[4]
-    index, pixels = mapper.observations(stamp)
-    inside = points.points_in_model[index] @ camera_from_model[:3, :3].T + camera_from_model[:3, 3]
-    projected = inside[:, :2] / inside[:, 2:] * 900.0 + [639.5, 359.5]
-    assert len(index) > 300
-    assert np.linalg.norm(projected - pixels, axis=1).max() < 3.0
-    assert np.median(np.linalg.norm(projected - pixels, axis=1)) < 3 * NOISE
-
-
-def test_neighbours_are_ordered_by_shared_points(straight: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
-    mapper, _ = straight
-    neighbours = mapper.neighbours(7 * STEP)
-    shared = [count for _, count in neighbours]
-    assert shared == sorted(shared, reverse=True)
-    assert 7 * STEP not in dict(neighbours)
-    assert {neighbours[0][0], neighbours[1][0]} <= {5 * STEP, 6 * STEP, 8 * STEP, 9 * STEP}
-
-
 def test_ties_are_told_once_and_again_when_they_change() -> None:
     mapper = Mapper(MapperConfig())
     for n in range(4):
@@ -149,7 +126,7 @@ def test_ties_are_told_once_and_again_when_they_change() -> None:
 
 def test_the_same_keyframes_give_the_same_bytes() -> None:
     (first, _), (second, _) = walk(np.arange(0, 1.2, 0.2)), walk(np.arange(0, 1.2, 0.2))
-    assert first.points().points_in_model.tobytes() == second.points().points_in_model.tobytes()
+    assert first.depths(STEP).tobytes() == second.depths(STEP).tobytes()
     for stamp, camera_from_model in first.camera_from_model().items():
         assert camera_from_model.tobytes() == second.camera_from_model()[stamp].tobytes()
 
@@ -198,7 +175,7 @@ def test_a_keyframe_with_hardly_any_feature_waits(count: int) -> None:
         assert not mapper.add_features(n * STEP, few, CAMERA).registered
     mapper.finish()
     assert mapper.camera_from_model() == {}
-    assert len(mapper.points().error) == 0
+    assert mapper.reprojection_error == 0
     assert all(not tie.registered and tie.overlap == 0 for tie in mapper.ties())
 
 
@@ -207,3 +184,31 @@ def test_turning_on_the_spot_starts_no_model() -> None:
     for n in range(5):
         assert not mapper.add_features(n * STEP, view(pose(0.0, 0.05 * n), n), CAMERA).registered
     assert mapper.models == 0
+
+
+def test_retired_keyframes_leave_the_map_and_the_others_stay() -> None:
+    mapper, truth = walk(np.arange(0, 2, 0.1))
+    retired = [n * STEP for n in range(1, 20, 2)]
+    mapper.ties()
+    mapper.retire([*retired, 99])
+    left = {stamp: pose for stamp, pose in truth.items() if stamp not in retired}
+    assert (mapper.seen, mapper.registered, mapper.waiting) == (len(left), len(left), 0)
+    told = mapper.ties()
+    assert [tie.stamp for tie in told] == sorted(left)
+    # What the neighbours of old shared with those that left does not count any more.
+    assert told[0].matches_next == told[1].matches_previous > 100
+    assert mapper.add_features(20 * STEP, view(pose(2.0), 20), CAMERA).registered
+    mapper.finish()
+    poses = mapper.camera_from_model()
+    assert list(poses) == [*sorted(left), 20 * STEP]
+    assert position_errors(poses, {**left, 20 * STEP: pose(2.0)}).max() < POSITION_TOLERANCE
+
+
+def test_a_model_whose_keyframes_are_retired_is_given_up() -> None:
+    mapper = Mapper(MapperConfig())
+    for n in range(3):
+        mapper.add_features(n * STEP, view(pose(0.2 * n), n), CAMERA)
+    mapper.retire([0, 2 * STEP])
+    assert (mapper.seen, mapper.models, mapper.waiting) == (1, 0, 1)
+    assert mapper.add_features(3 * STEP, view(pose(0.6), 3), CAMERA).registered
+    assert (mapper.models, mapper.registered) == (1, 2)
