@@ -7,8 +7,6 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-import cv2
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -18,9 +16,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_frames.config import FramesConfig
+from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
 from pipeprog_frames.ring import Frame, FrameRing
-from pipeprog_frames.selector import Decision, FrameSelector
-from pipeprog_frames.tracker import GrayImage, is_cut_off, reduction
+from pipeprog_frames.selector import DAMAGED, Decision, FrameSelector, Load
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
@@ -31,12 +29,6 @@ from pipeprog_node.parameters import declare
 MAX_QUEUE = 30  # one second of a fast camera; more would only be late
 LISTENERS = 2  # in lockstep: SfM and detector, without whom the first keyframe would be lost
 MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
-REDUCED = {
-    1: cv2.IMREAD_GRAYSCALE,
-    2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
-    4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
-    8: cv2.IMREAD_REDUCED_GRAYSCALE_8,
-}
 
 
 class FramesNode(Node):
@@ -144,41 +136,40 @@ class FramesNode(Node):
         assert self._selector is not None
         self._considered += 1
         stamp = messages.stamp_ns(message.header.stamp)
-        gray, encoded = self._reduce(message)
-        if gray is None:
-            self._damaged += 1
-        else:
+        encoded, load = self._open(message, self._camera)
+        if encoded:
             self._ring.add(Frame(stamp, message.header.frame_id, encoded, self._camera))
-        self._decide(self._selector.consider(stamp, gray))
+        self._decide(self._selector.consider(stamp, load if encoded else None))
 
-    def _reduce(self, message: Image | CompressedImage) -> tuple[GrayImage | None, bytes]:
-        """The reduced grey image (None: damaged) and the image's compressed bytes."""
-        assert self._camera is not None
-        factor = reduction(self._camera.width)
-        size = (-(-self._camera.width // factor), -(-self._camera.height // factor))
+    def _open(self, message: Image | CompressedImage, camera: Camera) -> tuple[bytes, Load]:
+        """The image's compressed bytes (none: damaged), and what decodes it reduced and grey."""
         if isinstance(message, CompressedImage):
             encoded = bytes(message.data)
-            gray = None if is_cut_off(encoded) else cv2.imdecode(np.frombuffer(encoded, np.uint8), REDUCED[factor])
-        else:
-            try:
-                image = messages.image_from_msg(message)
-            except InputError as error:
-                self.get_logger().error(str(error), throttle_duration_sec=10.0)
-                return None, b""
-            encoded = messages.encode_jpeg(image)
-            gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-        if gray is not None and (gray.shape[1], gray.shape[0]) != size:
-            self.get_logger().error(
-                f"images do not have the size of CameraInfo ({self._camera.width} x {self._camera.height}): "
-                "calibrate at the size that the camera sends",
-                throttle_duration_sec=10.0,
+            return b"" if is_cut_off(encoded) else encoded, lambda: self._fitting(
+                decode_reduced(encoded, camera.width), camera
             )
-            return None, b""
-        return gray, encoded
+        try:
+            image = messages.image_from_msg(message)
+        except InputError as error:
+            self.get_logger().error(str(error), throttle_duration_sec=10.0)
+            return b"", lambda: None
+        gray = self._fitting(reduce_image(image), camera)
+        return messages.encode_jpeg(image), lambda: gray
+
+    def _fitting(self, gray: GrayImage | None, camera: Camera) -> GrayImage | None:
+        """The reduced image, if it has the size that the calibration is for."""
+        if gray is None or (gray.shape[1], gray.shape[0]) == reduced_size(camera.width, camera.height):
+            return gray
+        self.get_logger().error(
+            f"images do not have the size of CameraInfo ({camera.width} x {camera.height}): "
+            "calibrate at the size that the camera sends",
+            throttle_duration_sec=10.0,
+        )
+        return None
 
     def _decide(self, decisions: list[Decision]) -> None:
         for decision in decisions:
+            self._damaged += decision.reason == DAMAGED
             frame = self._ring.get(decision.stamp)
             self._decisions.publish(
                 FrameDecision(

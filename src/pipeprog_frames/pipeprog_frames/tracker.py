@@ -2,41 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
+from pipeprog_frames.decoding import GrayImage
 
-GrayImage = NDArray[np.uint8]
 PointArray = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
 
-WORKING_WIDTH = 320  # wide enough for a few hundred corners; decoding a JPEG at 1/4 or 1/8 size skips most of its cost
-MAX_CORNERS = 200
+MAX_CORNERS = 120  # four times what a hull and a median need: half the image may slide out
 MIN_CORNERS = 30  # below this a hull and a median say nothing
 MIN_TRACKED = 10  # an affine map takes three: the rest are witnesses
 AGREEING_MIN = 0.4  # corners that slid agree by chance on some map: a minority is no evidence
 RELIEF_MAX = 0.03  # share of the width by which near and far points may part from one affine map between keyframes
-LK_WINDOW = (13, 13)
-LK_LEVELS = 4  # reaches 13/2 * 2^4 = 104 px, a third of the width: a turn of 18 degrees between frames
-LK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
-
-
-def reduction(width: int) -> int:
-    """By how much (1, 2, 4 or 8) an image of this width is reduced to come nearest above WORKING_WIDTH."""
-    return max((factor for factor in (1, 2, 4, 8) if width // factor >= WORKING_WIDTH), default=1)
-
-
-def is_cut_off(encoded: bytes) -> bool:
-    """Whether these bytes are no whole image: the decoder paints the missing part of a JPEG grey and says nothing."""
-    return not encoded or (encoded.startswith(b"\xff\xd8") and b"\xff\xd9" not in encoded[-64:])
+LK_WINDOW = (9, 9)  # at the coarsest level already half of the image's height: a larger one would look past its edge
+LK_LEVELS = 4  # reaches 9/2 * 2^4 = 72 px, a quarter of the width: a turn of 16 degrees between frames
+LK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)  # finer than what a share of area asks for
+KABSCH_ROUNDS = 3  # more move the median by less than a pixel of the full image, a fiftieth of what makes a keyframe
 
 
 def sharpness(gray: GrayImage) -> float:
     """Variance of the Laplacian; comparable among neighbouring frames only."""
-    return float(cv2.Laplacian(gray, cv2.CV_32F).var())
+    deviation = cv2.meanStdDev(cv2.Laplacian(gray, cv2.CV_16S))[1]
+    return float(deviation[0, 0]) ** 2
 
 
 def corners(gray: GrayImage) -> PointArray:
@@ -61,62 +53,79 @@ class Track:
     tracked: int
 
 
+@dataclass(frozen=True)
+class _State:
+    """The last image, and the (N, 2) corners still held: their (N, 3) rays and places in the keyframe, places in it."""
+
+    image: GrayImage
+    rays: FloatArray
+    reference: PointArray
+    current: PointArray
+
+    def kept(self, held: NDArray[np.bool_]) -> _State:
+        return _State(self.image, self.rays[held], self.reference[held], self.current[held])
+
+
 class Tracker:
     """Follows the corners of the last keyframe from frame to frame (pyramidal Lucas-Kanade)."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._previous: GrayImage = np.empty((0, 0), np.uint8)
-        self._reference: PointArray = np.empty((0, 2), np.float32)
-        self._current: PointArray = np.empty((0, 2), np.float32)
-        self._undo = (self._previous, self._reference, self._current)
+        none = np.empty((0, 2), np.float32)
+        self._state = self._undo = _State(np.empty((0, 0), np.uint8), np.empty((0, 3)), none, none)
 
     def start(self, gray: GrayImage) -> int:
         """Makes (h, w) `gray` the keyframe; returns its number of corners."""
-        self._previous = gray
-        self._reference = self._current = corners(gray)
-        return len(self._reference)
+        found = corners(gray)
+        self._state = _State(gray, self._unit_rays(found, gray.shape[1]), found, found)
+        return len(found)
 
     def track(self, gray: GrayImage) -> Track:
         """Follows the corners into (h, w) `gray`; start() comes before."""
-        self._undo = (self._previous, self._reference, self._current)
+        self._undo = before = self._state
         height, width = gray.shape
-        affine = None
-        if len(self._current) >= MIN_TRACKED:
-            moved, found, _ = cv2.calcOpticalFlowPyrLK(
-                self._previous, gray, self._current, None, winSize=LK_WINDOW, maxLevel=LK_LEVELS, criteria=LK_CRITERIA
-            )
-            held = (found.ravel() > 0) & (moved >= 0).all(axis=1) & (moved < (width, height)).all(axis=1)
-            self._reference, self._current = self._reference[held], moved[held]
-        if len(self._current) >= MIN_TRACKED:
-            affine, inliers = cv2.estimateAffine2D(
-                self._reference, self._current, ransacReprojThreshold=RELIEF_MAX * width
-            )
-        self._previous = gray
+        if len(before.current) < MIN_TRACKED:
+            return self._lost(gray)
+        moved, found, _ = cv2.calcOpticalFlowPyrLK(
+            before.image, gray, before.current, None, winSize=LK_WINDOW, maxLevel=LK_LEVELS, criteria=LK_CRITERIA
+        )
+        held = (found.ravel() > 0) & (moved >= 0).all(axis=1) & (moved < (width, height)).all(axis=1)
+        if held.sum() < MIN_TRACKED:
+            return self._lost(gray)
+        state = _State(gray, before.rays, before.reference, moved).kept(held)
+        affine, inliers = cv2.estimateAffine2D(state.reference, state.current, ransacReprojThreshold=RELIEF_MAX * width)
         if affine is None or inliers.sum() < max(MIN_TRACKED, AGREEING_MIN * len(inliers)):
-            return Track(0.0, float("nan"), 0)
-        held = inliers.ravel() > 0
-        self._reference, self._current = self._reference[held], self._current[held]
-        return Track(_shared_area(affine, width, height), self._parallax(width), len(self._current))
+            return self._lost(gray)
+        self._state = state.kept(inliers.ravel() > 0)
+        return Track(_shared_area(affine, width, height), self._parallax(), len(self._state.current))
 
     def undo(self) -> None:
         """Forgets the last frame tracked: a covered lens or a dark second must not lose the corners."""
-        self._previous, self._reference, self._current = self._undo
+        self._state = self._undo
 
-    def _parallax(self, width: int) -> float:
+    def _lost(self, gray: GrayImage) -> Track:
+        none = np.zeros(len(self._state.current), bool)
+        self._state = replace(self._state.kept(none), image=gray)
+        return Track(0.0, float("nan"), 0)
+
+    def _unit_rays(self, points: PointArray, width: int) -> FloatArray:
+        """(N, 3) directions of (N, 2) points of the reduced image."""
+        camera = self._camera
+        pixels = camera.undistort_points((points + 0.5) * (camera.width / width) - 0.5)
+        rays = np.ones((len(points), 3))
+        rays[:, :2] = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
+
+    def _parallax(self) -> float:
         """Median displacement that no rotation of the camera explains [px of the full image]."""
-        factor = self._camera.width / width
-        rays = []
-        for points in (self._reference, self._current):
-            pixels = self._camera.undistort_points((points + 0.5) * factor - 0.5)
-            plane = (pixels - (self._camera.cx, self._camera.cy)) / (self._camera.fx, self._camera.fy)
-            ray = np.c_[plane, np.ones(len(plane))]
-            rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-        reference, current = rays
+        reference = self._state.rays
+        current = self._unit_rays(self._state.current, self._state.image.shape[1])
         weights = np.ones(len(reference))
-        for _ in range(4):  # reweighted Kabsch: near points, which move most, must not turn the far ones
-            u, _, vt = np.linalg.svd((current * weights[:, None]).T @ reference)
-            rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-            residual = np.linalg.norm(current - reference @ rotation.T, axis=1)
+        for _ in range(KABSCH_ROUNDS):  # reweighted: near points, which move most, must not turn the far ones
+            u, _, vt = np.linalg.svd((current.T * weights) @ reference)
+            if np.linalg.det(u @ vt) < 0:
+                u[:, 2] = -u[:, 2]
+            difference = current - reference @ (u @ vt).T
+            residual = np.sqrt(np.einsum("ij,ij->i", difference, difference))
             weights = 1.0 / np.maximum(residual, 1e-4)
         return float(np.median(residual)) * self._camera.fx

@@ -1,3 +1,6 @@
+from collections.abc import Sequence
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
@@ -5,8 +8,9 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.selector import Decision, FrameSelector
-from pipeprog_frames.tracker import Tracker, is_cut_off, reduction
+from pipeprog_frames.decoding import is_cut_off, reduction
+from pipeprog_frames.selector import Decision, FrameSelector, Load
+from pipeprog_frames.tracker import Tracker
 
 WIDTH, HEIGHT = 320, 180
 CAMERA = Camera(WIDTH * 4, HEIGHT * 4, 900.0, 900.0, WIDTH * 2.0, HEIGHT * 2.0)
@@ -25,8 +29,14 @@ def pan(wall: NDArray[np.uint8], x: float) -> NDArray[np.uint8]:
     return cv2.warpAffine(wall, shift, (WIDTH, HEIGHT))
 
 
-def run(selector: FrameSelector, images: list[NDArray[np.uint8] | None]) -> list[Decision]:
-    decisions = [d for index, image in enumerate(images) for d in selector.consider(index + 1, image)]
+def load(image: NDArray[np.uint8] | None) -> Load | None:
+    return None if image is None else lambda: image
+
+
+def run(selector: FrameSelector, images: Sequence[NDArray[np.uint8] | None], fps: float = 5.0) -> list[Decision]:
+    """Decisions in order of time; the first stamp is 1."""
+    period = round(1e9 / fps)
+    decisions = [d for index, image in enumerate(images) for d in selector.consider(index * period + 1, load(image))]
     return sorted(decisions + selector.flush(), key=lambda decision: decision.stamp)
 
 
@@ -47,8 +57,7 @@ def test_pan_takes_the_fewest_frames_that_keep_the_overlap(wall: NDArray[np.uint
     step = 8  # px, 2.5 % of the width: five steps keep 0.875, six fall to 0.85
     images: list[NDArray[np.uint8] | None] = [pan(wall, step * index) for index in range(100)]
     decisions = run(FrameSelector(FramesConfig(overlap_min=0.86), CAMERA), images)
-    chosen = [decision.stamp for decision in decisions if decision.chosen]
-    gaps = np.diff(chosen)
+    gaps = np.diff([index for index, decision in enumerate(decisions) if decision.chosen])
     assert len(decisions) == 100
     assert gaps.max() <= 5
     assert np.median(gaps) == 5
@@ -82,11 +91,59 @@ def test_covered_lens_and_damaged_frames_cost_themselves_alone(wall: NDArray[np.
     assert abs(sum(decision.chosen for decision in decisions) - len(plain)) <= 1
 
 
+@pytest.mark.parametrize("step", [0.8, 2.5, 6.0])
+def test_what_is_not_looked_at_changes_no_choice_by_more_than_a_frame(wall: NDArray[np.uint8], step: float) -> None:
+    """Of a 30 Hz stream most frames are not even decoded; a 5 Hz one, where each counts, is looked at in full."""
+    images = [pan(wall, step * index) for index in range(min(200, int(1500 / step)))]
+    chosen, looks = {}, {}
+    for fps in (5.0, 30.0):
+        seen: set[int] = set()
+
+        def look(index: int, seen: set[int] = seen) -> NDArray[np.uint8]:
+            seen.add(index)
+            return images[index]
+
+        selector = FrameSelector(FramesConfig(), CAMERA)
+        decisions = []
+        for index in range(len(images)):
+            decisions += selector.consider(round(index * 1e9 / fps), partial(look, index))
+        decisions += selector.flush()
+        assert len(decisions) == len(images)
+        chosen[fps], looks[fps] = sum(decision.chosen for decision in decisions), len(seen)
+    assert looks[5.0] == len(images)
+    assert chosen[5.0] > 3
+    assert chosen[30.0] == pytest.approx(chosen[5.0], rel=0.1)
+    if step < 2.0:
+        assert looks[30.0] < 0.5 * len(images)
+
+
+def test_a_sudden_turn_after_a_rest_loses_nothing(wall: NDArray[np.uint8]) -> None:
+    """While nothing moves few frames are looked at; a turn of 90 degrees a second is followed from its first frame."""
+    step = WIDTH / 70 * 3  # 3 degrees a frame at 30 Hz
+    images = [pan(wall, 0)] * 30 + [pan(wall, step * index) for index in range(1, 31)]
+    decisions = run(FrameSelector(FramesConfig(), CAMERA), images, fps=30.0)
+    chosen = [index for index, decision in enumerate(decisions) if decision.chosen]
+    assert chosen[0] == 0
+    assert min(chosen[1:]) >= 30
+    assert np.diff([29, *chosen[1:]]).max() * step <= (1 - FramesConfig().overlap_min) * WIDTH
+    assert chosen[-1] * step > (59 - 4) * step
+
+
+def test_relief_asks_for_fewer_keyframes(wall: NDArray[np.uint8]) -> None:
+    images = [pan(wall, 6.0 * index) for index in range(120)]
+    counts = []
+    for relief in (0.0, 0.5, 1.0):
+        selector = FrameSelector(FramesConfig(), CAMERA)
+        selector.relieve(relief)
+        counts.append(sum(decision.chosen for decision in run(selector, images)))
+    assert counts[0] > counts[1] > counts[2] > 3
+
+
 def test_stamps_that_run_backwards_or_repeat(wall: NDArray[np.uint8]) -> None:
     selector = FrameSelector(FramesConfig(), CAMERA)
-    selector.consider(10, pan(wall, 0))
-    assert selector.consider(10, pan(wall, 1))[0].reason == "stamp repeats"
-    assert selector.consider(5, pan(wall, 2))[0].reason == "stamp runs backwards"
+    selector.consider(10, load(pan(wall, 0)))
+    assert selector.consider(10, load(pan(wall, 1)))[0].reason == "stamp repeats"
+    assert selector.consider(5, load(pan(wall, 2)))[0].reason == "stamp runs backwards"
 
 
 @pytest.mark.parametrize(

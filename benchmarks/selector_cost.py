@@ -1,0 +1,102 @@
+"""What choosing a frame costs beside decoding it: one run over one recording, at its size and at 4K.
+
+    .venv/bin/python -m benchmarks.selector_cost [BAG.mcap ...]
+
+Prints, for each recording, the time of the selector alone per frame over that of a full-size cv2.imdecode of the same
+frames, both on one thread, and writes results/selector_cost.json beside this file. The 4K frames are those of the
+recording, enlarged, with the noise of a sensor: truly finer ones have more bytes a frame, which is all decoding.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CompressedImage
+
+from pipeprog_bringup.bag import Bag
+from pipeprog_camera.camera import Camera
+from pipeprog_frames.config import FramesConfig
+from pipeprog_frames.decoding import decode_reduced
+from pipeprog_frames.selector import FrameSelector
+
+ROOT = Path(__file__).parents[1]
+RESULTS = Path(__file__).parent / "results" / "selector_cost.json"
+ROUNDS = 5  # the least of them counts: other work on the machine only adds
+ENLARGED = 40  # frames, of 1 MB each
+
+Encoded = list[tuple[int, bytes]]
+
+
+def main(paths: Sequence[Path]) -> None:
+    """Measure each recording at its size and at 4K."""
+    cv2.setNumThreads(1)
+    rows = []
+    for path in paths:
+        bag = Bag.open(path)
+        frames = [(frame.stamp, bytes(deserialize_message(frame.data, CompressedImage).data)) for frame in bag]
+        rows.append(_measure(path.stem, frames, bag.camera))
+        factor = 3840 / bag.camera.width
+        large = [(stamp, _enlarged(encoded, factor, stamp)) for stamp, encoded in frames[:ENLARGED]]
+        rows.append(_measure(path.stem, large, bag.camera.scaled(factor)))
+    print("recording              size   fps frames chosen     decode   selector  ratio")
+    for row in rows:
+        print(
+            f"{row['recording']:16} {row['size']:>10} {row['fps']:5.1f} {row['frames']:6d} {row['chosen']:6d} "
+            f"{row['decode_ms']:6.2f} ms {row['selector_ms']:6.2f} ms {row['ratio']:6.2f}"
+        )
+    RESULTS.write_text(json.dumps({"must": 1.0, "aim": 0.4, "rows": rows}, indent=1) + "\n")
+
+
+def _measure(name: str, frames: Encoded, camera: Camera) -> dict[str, str | float | int]:
+    """One row of the table."""
+    chosen = 0
+
+    def select() -> None:
+        nonlocal chosen
+        selector = FrameSelector(FramesConfig(), camera)
+        decisions = []
+        for stamp, encoded in frames:
+            decisions += selector.consider(stamp, lambda encoded=encoded: decode_reduced(encoded, camera.width))
+        chosen = sum(decision.chosen for decision in decisions + selector.flush())
+
+    def decode() -> None:
+        for _, encoded in frames:
+            cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+
+    # In turn, so that both meet the same machine.
+    times = np.array([(_seconds(decode), _seconds(select)) for _ in range(ROUNDS)]).min(axis=0) / len(frames)
+    return {
+        "recording": name,
+        "size": f"{camera.width} x {camera.height}",
+        "fps": round((len(frames) - 1) * 1e9 / (frames[-1][0] - frames[0][0]), 1),
+        "frames": len(frames),
+        "chosen": chosen,
+        "decode_ms": round(1e3 * float(times[0]), 3),
+        "selector_ms": round(1e3 * float(times[1]), 3),
+        "ratio": round(float(times[1] / times[0]), 3),
+    }
+
+
+def _seconds(work: Callable[[], None]) -> float:
+    started = time.process_time()
+    work()
+    return time.process_time() - started
+
+
+def _enlarged(encoded: bytes, factor: float, seed: int) -> bytes:
+    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+    large = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    noise = np.random.default_rng(seed).standard_normal(large.shape, np.float32)
+    noisy = np.clip(large + noise, 0, 255).astype(np.uint8)
+    return cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+
+
+if __name__ == "__main__":
+    main([Path(argument) for argument in sys.argv[1:]] or [ROOT / "bags" / "demo.mcap"])
