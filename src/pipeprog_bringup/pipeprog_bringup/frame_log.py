@@ -7,6 +7,8 @@ from dataclasses import replace
 
 from pipeprog_bringup.results import FrameRow
 
+FAULTS = ("damaged", "stamp")  # how the reasons begin that lie in the recording, not in what it shows
+
 
 class FrameLog:
     """Rows of frames.csv in the order of playing, filled by the decisions and the SfM's feedback as they come."""
@@ -70,5 +72,14 @@ class FrameLog:
 
     def common_reasons(self) -> str:
         """The reasons most frequent among the frames that were not chosen, for an error's text."""
-        reasons = Counter(row.reason for row in self._rows if row is not None and not row.chosen)
-        return "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))
+        return "; ".join(f"{count} x {reason}" for reason, count in self._reasons().most_common(3))
+
+    def faults(self) -> list[str]:
+        """What is wrong with the recording's frames, one sentence each."""
+        reasons = self._reasons()
+        return [
+            f"{reasons[reason]} frames left out: {reason}" for reason in sorted(reasons) if reason.startswith(FAULTS)
+        ]
+
+    def _reasons(self) -> Counter[str]:
+        return Counter(row.reason for row in self._rows if row is not None and not row.chosen)

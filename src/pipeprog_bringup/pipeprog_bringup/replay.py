@@ -44,6 +44,7 @@ START_SECONDS = 90.0  # until all nodes have found each other: imports of a cold
 SILENCE_SECONDS = 60.0  # a node whose diagnostics (1 Hz) stay away that long hangs
 # Between two decisions lie a few keyframes at most; the slowest machine works one off in less.
 STANDSTILL_SECONDS = 300.0
+MIN_KEYFRAMES = 3  # fewer make no map worth the name
 _MOVING = ("choosing keyframes", "working off the last keyframes")  # stages in which decisions and feedback arrive
 DELIVERY_SECONDS = 60.0  # for the last messages, once the node has said that they are published
 
@@ -152,6 +153,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
                 },
             },
         )
+        losses = bag.losses + run.log.faults()
         facts = {
             "command": "replay",
             "bag": str(request.bag.resolve()),
@@ -159,13 +161,13 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             "frames_considered": run.log.considered,
             "keyframes": run.log.chosen,
             "registered": status.keyframes_registered,
-            "losses": bag.losses,
+            "losses": losses,
             "seeds": {node: config.seed for node, config in configs.items() if hasattr(config, "seed")},
             "timings_s": {**timings, "write": time.monotonic() - started},
         }
         results.write_run(folder, facts)
     registered = status.keyframes_registered
-    return Outcome(pipes, classes, run.log.considered, run.log.chosen, registered, bag.losses)
+    return Outcome(pipes, classes, run.log.considered, run.log.chosen, registered, losses)
 
 
 class _Run:
@@ -278,8 +280,10 @@ class _Run:
             self._spin()
         response = future.result()
         if not response.success:
-            reasons = f" ({self.log.common_reasons()})" if name == "frames" and self.log.common_reasons() else ""
-            raise InputError(f"{response.message or f'{name} found nothing to work on'}{reasons}")
+            # With so few keyframes it is the frames left out that explain the failure.
+            reasons = self.log.common_reasons() if self.log.chosen < MIN_KEYFRAMES else ""
+            message = response.message or f"{name} found nothing to work on"
+            raise InputError(f"{message} ({reasons})" if reasons else message)
         return response.outputs
 
     def _receive(self, *kinds: type) -> None:

@@ -128,9 +128,18 @@ def test_frames_of_one_stamp_each_get_a_decision() -> None:
     log.play(1)
     log.decide(row(1, True))
     assert log.in_flight == 1
-    log.decide(row(1, False, "repeated stamp"))
-    assert [(r.chosen, r.reason) for r in log.rows()] == [(True, "why"), (False, "repeated stamp")]
-    assert log.common_reasons() == "1 x repeated stamp"
+    log.decide(row(1, False, "stamp repeats"))
+    assert [(r.chosen, r.reason) for r in log.rows()] == [(True, "why"), (False, "stamp repeats")]
+    assert log.common_reasons() == "1 x stamp repeats"
+
+
+def test_faults_are_told_apart_from_frames_that_nobody_needs() -> None:
+    log = FrameLog()
+    for stamp, reason in ((1, "overlap suffices"), (2, "damaged image"), (3, "damaged image")):
+        log.play(stamp)
+        log.decide(row(stamp, False, reason))
+    log.skip(4, "damaged message")
+    assert log.faults() == ["2 frames left out: damaged image", "1 frames left out: damaged message"]
 
 
 def test_settings_are_checked_before_anything_starts() -> None:
