@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+DIFFERENCE = 1e-3  # px that residuals are moved by for their derivatives: far above rounding, far below their curvature
+HOLD = 1e6  # what holds a coordinate, in units of its pose's largest entry
+
 
 @dataclass(frozen=True)
 class Adjusted:
@@ -79,6 +82,72 @@ def adjust(
         if gained <= tolerance * cost:
             break
     return Adjusted(rotation, translation, points, initial, cost, iteration)
+
+
+def function_covariance(
+    gradients: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    points: FloatArray,
+    start: IntArray,
+    view: IntArray,
+    rays: FloatArray,
+    focal: FloatArray,
+    *,
+    loss_scale: float,
+) -> FloatArray:
+    """(S, S) covariance of S functions of all adjusted poses which no similarity of the whole model changes.
+
+    gradients (S, C, 6): derivatives by each pose, turned from the left by a vector and shifted; the rest as in
+    `adjust`, at its minimum. This is the covariance of an M-estimator that trusts nothing but the independence of the
+    points (Huber 1967; White 1982; Liang and Zeger 1986, with points as clusters): whatever the localisation of a
+    feature has in common over the views of its point, and whatever the residuals show beyond noise, is counted.
+    """
+    count = len(rotation)
+    centres = -np.einsum("cji,cj->ci", rotation, translation)
+    index = np.append(np.arange(count - 1), -1)  # the last pose holds the model's place
+    pairs, row, column = _pairs(start, view, index, count - 1)
+    u, gc, v, gp, w = _linearise(rotation, translation, points, start, view, index, rays, focal, count - 1, loss_scale)
+    blocks, _, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(row), 0.0)
+    # One coordinate of the pose farthest from it holds the size.
+    far = int(np.linalg.norm(centres - centres[-1], axis=1).argmax())
+    axis = 3 + int(np.abs(rotation[far] @ (centres[far] - centres[-1])).argmax())
+    blocks[pairs[far, far], axis, axis] += HOLD * np.abs(blocks[pairs[far, far]]).max()
+
+    error = _residuals(rotation, translation, points, start, view, rays, focal)
+    square = (error**2).sum(axis=1)
+    weight = 1.0 / (1.0 + square / loss_scale**2)
+    scores = np.empty((len(gradients), len(points)))
+    for number, gradient in enumerate(gradients):
+        poses = _solve(blocks, row, column, gradient[:-1]).reshape(-1, 6)
+        moves = _back_substitute(poses, np.zeros_like(gp), w, v_inverse, start, view, index)
+        size = DIFFERENCE / max(float(np.abs(poses).max() * focal.max()), 1e-300)
+        ends = [
+            _residuals(
+                *_move(rotation, translation, index, step * poses), points + step * moves, start, view, rays, focal
+            )
+            for step in (size, -size)
+        ]
+        along = weight * (error * (ends[0] - ends[1])).sum(axis=1) / (2 * size)
+        scores[number] = np.add.reduceat(along, start[:-1])
+    # A robust loss curves less than its weights say, and the poses absorb some of the residuals.
+    curvature = float((weight - square * weight**2 / loss_scale**2).mean() / weight.mean())
+    freedom = 2 * len(view) - 3 * len(points)
+    return scores @ scores.T / curvature**2 * freedom / max(freedom - 6 * count + 7, 1)
+
+
+def _residuals(
+    rotation: FloatArray,
+    translation: FloatArray,
+    points: FloatArray,
+    start: IntArray,
+    view: IntArray,
+    rays: FloatArray,
+    focal: FloatArray,
+) -> FloatArray:
+    """(K, 2) reprojection errors, px."""
+    inside = np.einsum("kij,kj->ki", rotation[view], np.repeat(points, np.diff(start), axis=0)) + translation[view]
+    return (inside[:, :2] / inside[:, 2:] - rays) * focal[view]
 
 
 def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatArray) -> FloatArray:
