@@ -50,7 +50,7 @@ lint: setup ## ruff and mypy
 	@$(BIN)/mypy
 
 accuracy: setup ## accuracy against ground truth (slower than the tests)
-	@$(BIN)/python -m pytest tests/accuracy
+	@$(BIN)/python -m pytest -s tests/accuracy
 
 experiments: setup ## the paper's four experiments
 	@$(BIN)/python -m benchmarks.experiments

@@ -138,13 +138,14 @@ def make_site(
     sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain)
     frames = _frames(scene, lens, walk, sensor, times, seed, jobs)
     shown = track(frames, total=len(times), description=out.name, console=console)
-    write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown)
     write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, [c.share for c in seen]))
     write_bill(Path(f"{stem}.boq.yaml"), site)
     write_boards(Path(f"{stem}.board.yaml"), site)
     if surface:
         points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
         np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
+    # Last: where the recording is, all that belongs to it is there too.
+    write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown)
     console.print(f"{out}: {len(times)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
 
 

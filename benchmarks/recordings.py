@@ -1,0 +1,47 @@
+"""The recordings that the benchmarks measure: made once by the generator in bags/, kept in out/recordings."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "out" / "recordings"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An mcap file with its truth, bill of quantities and board beside it; `made_by` is the command that makes it."""
+
+    bag: Path
+    made_by: str
+
+    @property
+    def name(self) -> str:
+        """The file's name without its ending."""
+        return self.bag.stem
+
+    def beside(self, kind: str) -> Path:
+        """The file NAME.kind, such as truth.json."""
+        return self.bag.with_suffix(f".{kind}")
+
+
+DEMO = Recording(ROOT / "bags" / "demo.mcap", "bags/make_site.py lab bags/demo.mcap --seed 7 --seconds 13 --quality 85")
+
+
+def site(layout: str, seed: int, *options: str, folder: Path = FOLDER) -> Recording:
+    """A generated site: `lab` or `field`, its seed, and further options of bags/make_site.py."""
+    slug = "_".join(option.removeprefix("--").replace("=", "").replace(",", "+") for option in options)
+    bag = folder / f"{'_'.join(filter(None, (layout, str(seed), slug)))}.mcap"
+    command = ["bags/make_site.py", layout, str(bag.relative_to(ROOT)), "--seed", str(seed), *options, "--surface"]
+    return Recording(bag, " ".join(command))
+
+
+def made(recording: Recording) -> Recording:
+    """The recording, made now if it is not there; the generator shows its progress."""
+    if not recording.bag.exists():
+        arguments = recording.made_by.split()
+        subprocess.run([sys.executable, *arguments, "--jobs", "2"], cwd=ROOT, check=True)
+    return recording
