@@ -14,7 +14,10 @@ from pipeprog_frames.decoding import GrayImage
 PointArray = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-MAX_CORNERS = 120  # four times what a hull and a median need: half the image may slide out
+CELLS = 16  # along the image's longer side, one corner each: four times what a hull and a median need
+BLOCK = 3  # px, of the window that a corner is judged by
+LEAST_QUALITY = 0.01  # of the image's best corner
+LEAST_EIGENVALUE = 2e-5  # what two grey levels of noise make of a blank image at a quarter of its size: nothing to follow
 MIN_CORNERS = 30  # below this a hull and a median say nothing
 MIN_TRACKED = 10  # an affine map takes three: the rest are witnesses
 AGREEING_MIN = 0.4  # corners that slid agree by chance on some map: a minority is no evidence
@@ -32,9 +35,18 @@ def sharpness(gray: GrayImage) -> float:
 
 
 def corners(gray: GrayImage) -> PointArray:
-    """(N, 2) corners to track, spread over the image."""
-    found = cv2.goodFeaturesToTrack(gray, MAX_CORNERS, qualityLevel=0.01, minDistance=gray.shape[1] / 40)
-    return np.empty((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+    """(N, 2) corners to track: the best of each cell (Shi and Tomasi, CVPR 1994), so they are spread over the image."""
+    quality = cv2.cornerMinEigenVal(gray, BLOCK)
+    height, width = gray.shape
+    size = max(height, width) // CELLS
+    rows, columns = height // size, width // size
+    cells = quality[: rows * size, : columns * size].reshape(rows, size, columns, size).swapaxes(1, 2)
+    cells = cells.reshape(rows * columns, size * size)
+    best = cells.argmax(axis=1)
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    found = np.stack([column * size + best % size, row * size + best // size], axis=1).astype(np.float32)
+    strength = cells[np.arange(rows * columns), best]
+    return found[strength > max(LEAST_QUALITY * float(strength.max()), LEAST_EIGENVALUE)]
 
 
 def _shared_area(affine: NDArray[np.float64], width: int, height: int) -> float:
