@@ -18,6 +18,7 @@ from pipeprog_detect.edges import (
     profiles,
     sideways,
 )
+from pipeprog_detect.growth import KEPT, LEAST, grown
 from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.rim import End, find_end
@@ -35,6 +36,8 @@ CANDIDATES = 3
 # Edges count within so many pixels of the vote's and of the refined outlines.
 COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
 MIN_STATIONS = 20
+# A pipe of which a piece is known is followed so many times, each time as far again.
+MAX_GROWTH = 4
 # Cylinders that are not there stay under 0.1 (see `support`); the stated sigma grows where little is seen.
 MIN_SUPPORT = 0.15
 
@@ -66,11 +69,13 @@ def refine(
     others: Sequence[Cylinder],
     config: ContourConfig,
     planned_radii: Sequence[float] = (),
+    follow: bool = True,
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
     `initial_radius_sigma` [m] is the standard deviation of the given radius; that of the axis is taken as twice as
-    much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote.
+    much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the
+    pipe is made as long as its outlines are seen, and its ends are looked for.
 
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
@@ -85,24 +90,64 @@ def refine(
     prior = np.zeros(5)
     prior[:4] = 1.0 / (2.0 * initial_radius_sigma) ** 2
     scene = (views, others, basis)
-    view_offset: FloatArray = np.zeros(len(views))
-    blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, view_offset, CHUNK)
+    still: FloatArray = np.zeros(len(views))
+    blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, still, CHUNK)
     trials = [_improved(cylinder, candidate, scene, blur, prior) for candidate in candidates]
     step, _ = max(trials, key=lambda trial: trial[1])
+    refined = _fine(moved(cylinder, basis, step), scene, blur, prior, step)
+    for _ in range(MAX_GROWTH if follow else 0):
+        if refined is None:
+            break
+        longer = grown(refined.cylinder, refined.share, views, others, refined.solution.view_offset, blur)
+        if longer.length < refined.cylinder.length + LEAST:
+            break
+        # The direction that was known of the shorter one leaves the longer one's ends uncertain by as much more.
+        weaker = prior * (refined.cylinder.length / longer.length) ** 2
+        basis = frame(longer, viewing_direction(longer, views))
+        again = _fine(longer, (views, others, basis), blur, weaker, np.zeros(5))
+        if again is None or again.share < KEPT * refined.share:
+            break
+        refined, scene = again, (views, others, basis)
+    if refined is None or refined.share < MIN_SUPPORT or refined.cylinder.radius <= 0:
+        return None
+    ends: list[End | None] = [None, None]
+    if follow:
+        offset = refined.solution.view_offset
+        ends = [find_end(refined.cylinder, at_end, *scene, offset, blur) for at_end in (False, True)]
+    return _result(refined.cylinder, refined.solution, refined.share, basis, refined.at, ends)
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A cylinder after least squares on its sub-pixel edges, their stations and the share of them that support it."""
+
+    cylinder: Cylinder
+    solution: _Solution
+    share: float
+    at: Stations
+
+
+def _fine(
+    cylinder: Cylinder,
+    scene: tuple[Sequence[View], Sequence[Cylinder], FloatArray],
+    blur: float,
+    prior: FloatArray,
+    so_far: FloatArray,
+) -> _Refined | None:
+    """A few passes of least squares, the edges sought anew in each; None where too little is seen."""
+    views, _, basis = scene
+    view_offset: FloatArray = np.zeros(len(views))
+    step: FloatArray = np.zeros(5)
     for _ in range(FINE_PASSES):
         current = moved(cylinder, basis, step)
         at, edges = outline_edges(current, *scene, view_offset, _reach(current, views, FINE_REACH), blur, CHUNK)
         if len(at) < MIN_STATIONS:
             return None
-        solution = _solve(at, edges, len(views), prior, step)
+        solution = _solve(at, edges, len(views), prior, so_far + step)
         step = step + solution.step
         view_offset = solution.view_offset
-    refined = moved(cylinder, basis, step)
     share = support_profile(at, hits(at, _moved_by(edges, at, solution), view_offset)).share
-    if share < MIN_SUPPORT or refined.radius <= 0:
-        return None
-    ends = [find_end(refined, at_end, *scene, view_offset, blur) for at_end in (False, True)]
-    return _result(refined, solution, share, basis, at, ends)
+    return _Refined(moved(cylinder, basis, step), solution, share, at)
 
 
 def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:

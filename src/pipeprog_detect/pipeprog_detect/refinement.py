@@ -53,7 +53,7 @@ class Jury:
         """
         if any(_alike(candidate.cylinder, refused) for refused in self._refused):
             return False
-        fit = self._refined(candidate, [], self._few)
+        fit = self._refined(candidate, [], self._few, follow=False)
         if fit is None or fit.support < CONVINCING or not self._is_planned(fit):
             self._refused.append(candidate.cylinder)
             return False
@@ -93,7 +93,9 @@ class Jury:
     def _is_planned(self, fit: ContourFit) -> bool:
         return classify(fit.cylinder.radius, fit.radius_sigma, self._bill)[0] is not None
 
-    def _refined(self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]) -> ContourFit | None:
+    def _refined(
+        self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View], follow: bool = True
+    ) -> ContourFit | None:
         if not views:
             return None
         planned_radii = [planned.outer_radius for planned in self._bill.classes]
@@ -107,7 +109,7 @@ class Jury:
         for radius in starts:
             start = replace(cylinder, radius=radius)
             for _ in range(MAX_ROUNDS):
-                fit = refine(start, sigma, views, others, self._config, planned_radii)
+                fit = refine(start, sigma, views, others, self._config, planned_radii, follow)
                 if fit is None or abs(fit.cylinder.radius - start.radius) < SETTLED * start.radius:
                     break
                 start = fit.cylinder
