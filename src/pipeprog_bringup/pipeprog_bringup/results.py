@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from pipeprog_bringup.output import OutputFolder
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.bill import Bill
-from pipeprog_detect.classify import ClassProgress
+from pipeprog_detect.classify import ClassProgress, by_kmeans
+from pipeprog_detect.network import PipeRun, pipe_runs
 from pipeprog_detect.pipe import Pipe
 
 FloatArray = NDArray[np.float64]
@@ -54,8 +55,10 @@ class FrameRow:
 def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress], scale: Scale) -> None:
     """pipes.json, one line a pipe; lengths rounded to the micrometre, far below what any measurement tells."""
     head = {"frame_id": "map", "scale": {"source": scale.source, "sigma": _significant(scale.sigma)}}
+    kmeans = by_kmeans([pipe.cylinder.radius for pipe in pipes], [entry.outer_radius for entry in classes])
+    runs = pipe_runs([pipe.cylinder for pipe in pipes])
     rows = {
-        "pipes": [_pipe_entry(pipe) for pipe in pipes],
+        "pipes": [_pipe_entry(pipe, classes[k].name) for pipe, k in zip(pipes, kmeans, strict=True)],
         "classes": [
             {
                 "class": entry.name,
@@ -66,6 +69,7 @@ def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgre
             }
             for entry in classes
         ],
+        "runs": [_run_entry(number, run, pipes) for number, run in enumerate(runs, start=1)],
     }
     parts = [json.dumps(head, allow_nan=False)[1:-1]]
     for name, entries in rows.items():
@@ -181,7 +185,7 @@ def _lines(path: Path) -> list[str]:
         raise InputError(f"{path} cannot be read: {error}") from None
 
 
-def _pipe_entry(pipe: Pipe) -> dict[str, Any]:
+def _pipe_entry(pipe: Pipe, class_kmeans: str) -> dict[str, Any]:
     return {
         "id": pipe.id,
         "start": [round(float(value), 6) for value in pipe.cylinder.start],
@@ -191,9 +195,29 @@ def _pipe_entry(pipe: Pipe) -> dict[str, Any]:
         "length": round(pipe.cylinder.length, 6),
         "class": pipe.class_name,
         "class_probability": round(pipe.class_probability, 4),
+        "class_kmeans": class_kmeans,
+        "ambiguous": pipe.class_name is None and pipe.class_probability > 0.0,
         "visible_arc_deg": round(float(np.degrees(pipe.visible_arc)), 1),
         "rmse": _significant(pipe.rmse),
         "points": int(pipe.points),
+    }
+
+
+def _run_entry(number: int, run: PipeRun, pipes: Sequence[Pipe]) -> dict[str, Any]:
+    return {
+        "id": f"r{number:02d}",
+        "pipes": [pipes[k].id for k in run.pipes],
+        "barrel_length": round(run.barrel, 6),
+        "centre_line_length": round(run.centre_line, 6),
+        "joints": [
+            {
+                "kind": joint.kind,
+                "pipes": [pipes[k].id for k in joint.pipes],
+                "angle_deg": round(float(np.degrees(joint.angle)), 1),
+                "length": round(joint.length, 6),
+            }
+            for joint in run.joints
+        ],
     }
 
 

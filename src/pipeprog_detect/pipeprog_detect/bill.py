@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import yaml
@@ -45,19 +45,38 @@ NAMED_COLORS: dict[str, Color] = {
 _FIGURE_11 = {0.0086: "magenta", 0.0365: "blue", 0.0575: "cyan", 0.0841: "green", 0.1095: "red", 0.1223: "yellow"}
 _OTHERS = ("orange", "purple", "lime", "brown", "teal", "pink", "navy", "olive", "maroon", "silver")
 
+# Sewer pipes of PVC (EN 1401) have walls of a 34th to a 41st of the diameter. A bill of sewers may also give the bores
+# themselves as its sizes, which are then made to half a percent.
+_WALL_SHARE, _WALL_SPREAD = 0.5 * (2 / 34 + 2 / 41), 0.004
+_BORE_TOLERANCE = 0.005
+
 _SIZE_KEYS = ("outer_radius_mm", "outer_diameter_mm", "size")
-_KEYS = ("name", *_SIZE_KEYS, "planned_length_m", "color")
+_KEYS = ("name", *_SIZE_KEYS, "wall_mm", "planned_length_m", "color")
 
 
 @dataclass(frozen=True)
 class PipeClass:
-    """A planned class: outer radius and its tolerance (one standard deviation) [m], planned length [m], RGB in 0..1."""
+    """A planned class: outer radius and its tolerance (one standard deviation) [m], planned length [m], RGB in 0..1.
+
+    wall [m] is the thickness of its wall where the bill tells, of use to a camera inside.
+    """
 
     name: str
     outer_radius: float
     planned_length: float
     color: Color
     tolerance: float
+    wall: float | None = None
+
+    @property
+    def bores(self) -> tuple[tuple[float, float], ...]:
+        """Radii that its inner surface may have, and their tolerances (one standard deviation) [m]."""
+        if self.wall is not None:
+            return ((self.outer_radius - self.wall, self.tolerance),)
+        return (
+            (self.outer_radius * (1.0 - _WALL_SHARE), self.outer_radius * _WALL_SPREAD),
+            (self.outer_radius, self.outer_radius * _BORE_TOLERANCE),
+        )
 
 
 @dataclass(frozen=True)
@@ -120,7 +139,12 @@ def _read_class(path: Path, where: str, entry: object) -> PipeClass:
     if "planned_length_m" not in entry:
         raise InputError(f"{path}: {where} has no planned_length_m: give the metres that are planned")
     length = _positive(path, where, "planned_length_m", entry["planned_length_m"])
-    return PipeClass(name, radius, length, (0.5, 0.5, 0.5), tolerance)
+    wall = 1e-3 * _positive(path, where, "wall_mm", entry["wall_mm"]) if "wall_mm" in entry else None
+    if wall is not None and wall >= radius:
+        raise InputError(
+            f"{path}: {where}: wall_mm is {1e3 * wall:g}, more than the radius: write the wall's thickness"
+        )
+    return PipeClass(name, radius, length, (0.5, 0.5, 0.5), tolerance, wall)
 
 
 def _read_size(path: Path, where: str, entry: dict[str, object]) -> tuple[float, float]:
@@ -172,7 +196,7 @@ def _with_colors(path: Path, classes: list[PipeClass], entries: list[dict[str, o
         if color is None:
             color = spare[missing % len(spare)]
             missing += 1
-        done.append(PipeClass(new.name, new.outer_radius, new.planned_length, color, new.tolerance))
+        done.append(replace(new, color=color))
     return tuple(done)
 
 

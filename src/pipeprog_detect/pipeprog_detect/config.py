@@ -26,6 +26,10 @@ class DetectConfig:
         default="normals",
         metadata={"description": "how cylinders are found in the cloud", "unit": "", "choices": ("normals", "planes")},
     )
+    concave: bool = field(
+        default=False,
+        metadata={"description": "pipes are seen from inside, by a camera in a sewer, not from outside", "unit": ""},
+    )
     radius_min: float = field(
         default=0.005, metadata={"description": "thinnest pipe looked for", "unit": "m", "range": (0.001, 1.0)}
     )
@@ -35,5 +39,14 @@ class DetectConfig:
     arc_min_deg: float = field(
         default=60.0,
         metadata={"description": "least part of the circumference seen", "unit": "deg", "range": (10.0, 360.0)},
+    )
+    classifier: str = field(
+        default="posterior",
+        metadata={
+            "description": "posterior: fixed nominal radii and the measured sigma, none where none fits or two do; "
+            "kmeans: as in the paper, every pipe gets a class",
+            "unit": "",
+            "choices": ("posterior", "kmeans"),
+        },
     )
     contour: ContourConfig = field(default_factory=ContourConfig)

@@ -12,11 +12,12 @@ from pipeprog_detect import background, classify, hypotheses, normals, octree
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.hypotheses import Hypothesis
+from pipeprog_detect.inside import find_concave
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.refinement import Jury, Measured
 from pipeprog_detect.runs import elbows, join, near, spanning
-from pipeprog_detect.verify import Candidate, measure, own_points, settle, thin_start
+from pipeprog_detect.verify import Candidate, measure, outwardness, own_points, settle, thin_start
 
 # Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1 to 2 times as large. Fine to coarse, each on
 # what the ones before have not explained: a coarse patch may span two pipes of a rack, a fine one may not. The finest
@@ -65,20 +66,27 @@ def detect(
     report(0.15, "finding walls")
     _, on_plane = background.find_planes(tree, sigma, widest)
     tree = tree.subset(~on_plane)
+    outward = None if cloud.normals is None else np.asarray(cloud.normals, float)[finite][tree.order]
+    if config.concave:
+        report(0.3, "looking for pipes seen from inside")
+        bores = [radius for planned in bill.classes for radius, _ in planned.bores]
+        seen = find_concave(tree, outward, sigma, (0.7 * min(bores), 1.5 * max(bores)), config)
+        return _product([Measured(each, each.cylinder, each.radius_sigma) for each in seen], bill, shift, config)
     planned_radii = [planned.outer_radius for planned in bill.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
     jury = Jury(local_views if config.contour.enabled else [], bill, config.contour)
     noise = _STEREO_ON_PIPES * sigma if jury.sits else sigma
-    candidates = find_candidates(tree, noise, (config.radius_min, widest), planned_radii, config, jury, report)
+    radius_range = (config.radius_min, widest)
+    candidates = find_candidates(tree, outward, noise, radius_range, planned_radii, config, jury, report)
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(candidate, sigma, config) for candidate in candidates])
-    pipes = [_pipe(each, bill, shift) for each in measured]
     report(1.0, "done")
-    return _numbered(pipes)
+    return _product(measured, bill, shift, config)
 
 
 def find_candidates(
     tree: Octree,
+    outward: FloatArray | None,
     sigma: float,
     radius_range: tuple[float, float],
     planned_radii: Sequence[float],
@@ -88,14 +96,15 @@ def find_candidates(
 ) -> list[Candidate]:
     """Accepted cylinders of the tree's points, none sharing points with another.
 
-    What is too rough for the cloud alone is put to the images, where there are any.
+    Where their normals `outward` (N, 3), towards the cameras, are known, a corner or a hollow is none: it faces its
+    own axis. What is too rough for the cloud alone is put to the images, where there are any.
     """
     free = np.ones(len(tree.points), bool)
     accepted: list[Candidate] = []
 
     def consider(hypothesis: Hypothesis) -> None:
         candidate = measure(tree, free, hypothesis, sigma)
-        if candidate is None:
+        if candidate is None or (outward is not None and outwardness(tree, outward, candidate) < 0.0):
             return
         if is_pipe(candidate, sigma, config) or (
             is_pipe(candidate, sigma, config, _PROPOSED) and jury.vouches_for(candidate)
@@ -191,15 +200,21 @@ def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
     return pose
 
 
-def _pipe(measured: Measured, bill: Bill, shift: FloatArray) -> Pipe:
+def _product(measured: Sequence[Measured], bill: Bill, shift: FloatArray, config: DetectConfig) -> list[Pipe]:
+    """The classified pipes in the frame that the cloud came in."""
+    pipes = _numbered([_pipe(each, bill, shift, config.concave) for each in measured])
+    return classify.reclassified(pipes, bill, config.concave) if config.classifier == "kmeans" else pipes
+
+
+def _pipe(measured: Measured, bill: Bill, shift: FloatArray, concave: bool) -> Pipe:
     candidate, cylinder, sigma = measured.candidate, measured.cylinder, measured.radius_sigma
-    name, probability = classify.classify(cylinder.radius, sigma, bill)
+    verdict = classify.classify(cylinder.radius, sigma, bill, concave)
     return Pipe(
         "",
         Cylinder(cylinder.start + shift, cylinder.end + shift, cylinder.radius),
         sigma,
-        name,
-        probability,
+        verdict.name,
+        verdict.probability,
         candidate.evidence.arc,
         candidate.evidence.noise,
         candidate.points,
@@ -210,19 +225,7 @@ def _numbered(pipes: list[Pipe]) -> list[Pipe]:
     """Pipes with ids p01, p02, ..., sorted by place so that the order of their discovery does not show."""
     order = sorted(pipes, key=lambda pipe: tuple(np.round(0.5 * (pipe.cylinder.start + pipe.cylinder.end), 3)))
     width = max(2, len(str(len(order))))
-    return [
-        Pipe(
-            f"p{number:0{width}d}",
-            pipe.cylinder,
-            pipe.radius_sigma,
-            pipe.class_name,
-            pipe.class_probability,
-            pipe.visible_arc,
-            pipe.rmse,
-            pipe.points,
-        )
-        for number, pipe in enumerate(order, start=1)
-    ]
+    return [replace(pipe, id=f"p{number:0{width}d}") for number, pipe in enumerate(order, start=1)]
 
 
 def _silent(share: float, what: str) -> None:

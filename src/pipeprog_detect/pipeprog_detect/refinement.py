@@ -91,7 +91,7 @@ class Jury:
         return found
 
     def _is_planned(self, fit: ContourFit) -> bool:
-        return classify(fit.cylinder.radius, fit.radius_sigma, self._bill)[0] is not None
+        return classify(fit.cylinder.radius, fit.radius_sigma, self._bill).probability > 0.0
 
     def _refined(
         self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View], follow: bool = True

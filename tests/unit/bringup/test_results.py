@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ PIPE = Pipe(
     0.0011,
     20411,
 )
+SCALE = results.Scale("board", 0.0004)
 CLASSES = [ClassProgress("DN100", 0.0575, 24.0, 11.3, 100 * 11.3 / 24)]
 
 
@@ -45,6 +47,8 @@ def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
                 "length": 1.42,
                 "class": "DN100",
                 "class_probability": 0.99,
+                "class_kmeans": "DN100",
+                "ambiguous": False,
                 "visible_arc_deg": 149.0,
                 "rmse": 0.0011,
                 "points": 20411,
@@ -53,15 +57,31 @@ def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
         "classes": [
             {"class": "DN100", "outer_radius": 0.0575, "planned_m": 24.0, "installed_m": 11.3, "percent": 47.08}
         ],
+        "runs": [
+            {"id": "r01", "pipes": ["p03"], "barrel_length": 1.42, "centre_line_length": 1.42, "joints": []},
+        ],
     }
 
 
 def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     pipe = Pipe("p01", PIPE.cylinder, float("nan"), None, 0.0, 2.6, 0.001, 3)
-    results.write_pipes(tmp_path / "pipes.json", [pipe], [], results.Scale("board", None))
+    results.write_pipes(tmp_path / "pipes.json", [pipe], CLASSES, results.Scale("board", None))
     content = json.loads((tmp_path / "pipes.json").read_text())
     assert content["pipes"][0]["class"] is content["pipes"][0]["radius_sigma"] is content["scale"]["sigma"] is None
-    assert content["classes"] == []
+
+
+def test_what_two_classes_explain_is_ambiguous_and_runs_are_told(tmp_path: Path) -> None:
+    unsure = replace(PIPE, class_name=None, class_probability=0.6)
+    beyond = Cylinder(PIPE.cylinder.end + np.array([0, 0.2, 0.2]), PIPE.cylinder.end + np.array([0, 1.2, 0.2]), 0.0575)
+    results.write_pipes(tmp_path / "pipes.json", [unsure, replace(PIPE, id="p04", cylinder=beyond)], CLASSES, SCALE)
+    content = json.loads((tmp_path / "pipes.json").read_text())
+    assert [pipe["ambiguous"] for pipe in content["pipes"]] == [True, False]
+    assert [pipe["class_kmeans"] for pipe in content["pipes"]] == ["DN100", "DN100"]
+    (run,) = content["runs"]
+    assert run["pipes"] == ["p03", "p04"]
+    assert run["joints"][0]["kind"] == "elbow"
+    assert run["barrel_length"] == pytest.approx(2.42)
+    assert run["centre_line_length"] == pytest.approx(2.42 + 0.1 * np.pi)
 
 
 def test_progress_csv(tmp_path: Path) -> None:
