@@ -26,6 +26,8 @@ _SCALES = (0.028, 0.04, 0.056, 0.08, 0.113, 0.16, 0.02)
 _POINTS_PER_SCALE = 7.0
 # Stereo is rougher on pipes, curved and glossy, than on the walls that the noise is read from.
 _STEREO_ON_PIPES = 2.0
+# Mean cosine between the normals of a pipe and those of its points: noise turns a thin pipe's by less than 60 deg.
+_OUTWARD = 0.5
 # Candidates that the images judge may be so many times as rough as pipes that the cloud alone must vouch for.
 _PROPOSED = 2.0
 # Pipes up to this radius [m] are sought as lines of points, in neighbourhoods several times as wide.
@@ -75,11 +77,12 @@ def detect(
     planned_radii = [planned.outer_radius for planned in bill.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
     jury = Jury(local_views if config.contour.enabled else [], bill, config.contour)
-    noise = _STEREO_ON_PIPES * sigma if jury.sits else sigma
+    # A cloud with normals towards cameras is stereo's, too.
+    noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)
     candidates = find_candidates(tree, outward, noise, radius_range, planned_radii, config, jury, report)
     report(0.9, "measuring in the keyframes" if views else "measuring")
-    measured = jury.measure(candidates, [is_pipe(candidate, sigma, config) for candidate in candidates])
+    measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
     report(1.0, "done")
     return _product(measured, bill, shift, config)
 
@@ -104,7 +107,7 @@ def find_candidates(
 
     def consider(hypothesis: Hypothesis) -> None:
         candidate = measure(tree, free, hypothesis, sigma)
-        if candidate is None or (outward is not None and outwardness(tree, outward, candidate) < 0.0):
+        if candidate is None or (outward is not None and outwardness(tree, outward, candidate) < _OUTWARD):
             return
         if is_pipe(candidate, sigma, config) or (
             is_pipe(candidate, sigma, config, _PROPOSED) and jury.vouches_for(candidate)
