@@ -128,8 +128,11 @@ def function_covariance(
             )
             for step in (size, -size)
         ]
-        along = weight * (error * (ends[0] - ends[1])).sum(axis=1) / (2 * size)
-        scores[number] = np.add.reduceat(along, start[:-1])
+        derivative = (ends[0] - ends[1]) / (2 * size)
+        score = np.add.reduceat(weight * (error * derivative).sum(axis=1), start[:-1])
+        share = np.add.reduceat(weight * (derivative**2).sum(axis=1), start[:-1])
+        # A point that much depends on pulls the function along and hides its error (the jackknife's correction).
+        scores[number] = score / (1.0 - share / share.sum())
     # A robust loss curves less than its weights say, and the poses absorb some of the residuals.
     curvature = float((weight - square * weight**2 / loss_scale**2).mean() / weight.mean())
     freedom = 2 * len(view) - 3 * len(points)

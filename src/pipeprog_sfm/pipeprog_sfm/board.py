@@ -71,6 +71,23 @@ class BoardObservation:
     camera_from_board: FloatArray
 
 
+@dataclass(frozen=True)
+class Distance:
+    """A measured distance between the centres of two circles.
+
+    Attributes:
+        name: for people.
+        ends: name of the board and row of Board.centres, twice.
+        length: m.
+        sigma: standard deviation of `length`, m.
+    """
+
+    name: str
+    ends: tuple[tuple[str, int], tuple[str, int]]
+    length: float
+    sigma: float
+
+
 def load_boards(path: str | Path) -> list[Board]:
     """Boards of a BOARD.yaml file: `boards: [{name, circle_radius_mm, centres_mm: [[x, y], ...]}]`.
 
@@ -79,13 +96,7 @@ def load_boards(path: str | Path) -> list[Board]:
             has fewer than three circles, circles that overlap or lie on one line, a layout that looks the same
             turned by 120 degrees or less, or a name that is taken.
     """
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the board file cannot be read ({error})") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
-    entries = _entry(content, ("boards",), str(path))["boards"]
+    entries = _content(path)["boards"]
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: 'boards' must be a list with at least one board")
     boards: list[Board] = []
@@ -97,12 +108,57 @@ def load_boards(path: str | Path) -> list[Board]:
     return boards
 
 
-def _entry(value: Any, keys: Sequence[str], where: str) -> Mapping[str, Any]:
+def load_distances(path: str | Path, boards: Sequence[Board]) -> list[Distance]:
+    """Distances of a BOARD.yaml file: `distances: [{from: A/1, to: B/3, distance_mm, sigma_mm}]`, none without the key.
+
+    `A/1` is the first circle of board A.
+
+    Raises:
+        InputError: as `load_boards`, or a board or circle is not in the file, or a number is not positive.
+    """
+    entries = _content(path).get("distances", [])
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: 'distances' must be a list")
+    return [_distance(entry, f"{path}: distance {number}", boards) for number, entry in enumerate(entries, 1)]
+
+
+def _distance(value: Any, where: str, boards: Sequence[Board]) -> Distance:
+    entry = _entry(value, ("from", "to", "distance_mm", "sigma_mm"), where)
+    ends = []
+    for key in ("from", "to"):
+        name, _, number = str(entry[key]).rpartition("/")
+        count = next((len(board.centres) for board in boards if board.name == name), 0)
+        if not number.isdecimal() or not 1 <= int(number) <= count:
+            raise InputError(
+                f"{where}: '{key}: {entry[key]}' is no circle of the file: write BOARD/NUMBER, such as "
+                f"{boards[0].name}/1 for the first circle of board {boards[0].name}"
+            )
+        ends.append((name, int(number) - 1))
+    if ends[0] == ends[1]:
+        raise InputError(f"{where}: both ends are {entry['from']}")
+    length, sigma = (_number(entry[key], f"{where}: {key}") for key in ("distance_mm", "sigma_mm"))
+    if length <= 0 or sigma <= 0:
+        raise InputError(f"{where}: distance_mm and sigma_mm must be above zero")
+    return Distance(f"{entry['from']} to {entry['to']}", (ends[0], ends[1]), length / 1000, sigma / 1000)
+
+
+def _content(path: str | Path) -> Mapping[str, Any]:
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the board file cannot be read ({error})") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    return _entry(content, ("boards",), str(path), optional=("distances",))
+
+
+def _entry(value: Any, keys: Sequence[str], where: str, optional: Sequence[str] = ()) -> Mapping[str, Any]:
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected the keys {', '.join(keys)}, found {value!r}")
+    known = (*keys, *optional)
     for key in value:
-        if key not in keys:
-            near = difflib.get_close_matches(str(key), keys, 1, 0.0)[0]
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1, 0.0)[0]
             raise InputError(f"{where}: unknown key '{key}', did you mean '{near}'?")
     for key in keys:
         if key not in value:

@@ -8,18 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.board import Board, BoardObservation, identify
+from pipeprog_sfm.board import Board, BoardObservation, Distance, identify
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses, find_ellipses
-from pipeprog_sfm.scale import NoScaleError, ScaleEstimate, estimate_scale
+from pipeprog_sfm.metric import Evidence, estimate_scale
+from pipeprog_sfm.scale import NoScaleError, PoseCovariance, ScaleEstimate
 
 
 class BoardTracker:
     """Keeps the ellipses and the identified boards of every keyframe; the images themselves are not kept."""
 
-    def __init__(self, boards: Sequence[Board], config: BoardConfig) -> None:
+    def __init__(self, boards: Sequence[Board], config: BoardConfig, distances: Sequence[Distance] = ()) -> None:
         self._boards = tuple(boards)
+        self._distances = tuple(distances)
         self._config = config
         self._camera: Camera | None = None
         self._ellipses: dict[int, TargetEllipses] = {}
@@ -48,8 +50,9 @@ class BoardTracker:
             self._ellipses.pop(stamp, None)
             self._observations.pop(stamp, None)
 
-    def estimate(self, poses: Mapping[int, FloatArray]) -> ScaleEstimate:
+    def estimate(self, poses: Mapping[int, FloatArray], covariance: PoseCovariance | None = None) -> ScaleEstimate:
         """Scale and map frame for (4, 4) poses camera_from_model by stamp; raises NoScaleError with the reason."""
         if self._camera is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
-        return estimate_scale(self._observations, poses, self._camera, self._boards, self._config, self._ellipses)
+        evidence = Evidence(self._boards, self._distances, self._observations, self._ellipses)
+        return estimate_scale(evidence, poses, self._camera, self._config, covariance)

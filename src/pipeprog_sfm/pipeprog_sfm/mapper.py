@@ -192,6 +192,13 @@ class Mapper:
         model = self._published
         return {model.stamps[view]: model.pose(view) for view in np.argsort(model.stamps, kind="stable")}
 
+    def covariance(self, gradients: FloatArray) -> FloatArray:
+        """(S, S) covariance of functions of the published model's poses.
+
+        gradients (S, N, 6): derivatives by each pose of camera_from_model(), in its order; see `function_covariance`.
+        """
+        return self._published.covariance(gradients[:, np.argsort(np.argsort(self._published.stamps, kind="stable"))])
+
     def depths(self, stamp: int) -> FloatArray:
         """(K,) depths, in the model's unit, of the points that a keyframe of the published model sees."""
         model = self._published

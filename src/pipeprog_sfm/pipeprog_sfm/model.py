@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_sfm.adjustment import adjust
+from pipeprog_sfm.adjustment import adjust, function_covariance
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -200,6 +200,15 @@ class SparseModel:
             error = float(np.median(self.errors(features))) / RAYLEIGH_MEDIAN
             self.noise = min(max(error, NOISE_RANGE[0]), NOISE_RANGE[1])
         self.filter(ids, start, features)
+
+    def covariance(self, gradients: FloatArray) -> FloatArray:
+        """(S, S) covariance of functions of the poses whose derivatives are (S, V, 6): see `function_covariance`."""
+        ids, start, features = self.observations(np.ones(len(self.points), bool))
+        view = self.view_of[features].astype(np.int64)
+        return function_covariance(
+            gradients, self.rotation, self.translation, self.points[ids], start, view,
+            self.rays[features], self.focal, loss_scale=CAUCHY * self.noise,
+        )  # fmt: skip
 
     def filter(self, ids: IntArray, start: IntArray, features: IntArray) -> None:
         """Drops observations with a large error or behind the camera, second ones of a view, and thin points."""

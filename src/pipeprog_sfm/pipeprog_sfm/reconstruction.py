@@ -145,7 +145,7 @@ class Reconstruction:
             )
             raise NotMetricError(self._reason)
         try:
-            self._scale = self._targets.estimate(camera_from_model)
+            self._scale = self._targets.estimate(camera_from_model, self._mapper.covariance)
         except NoScaleError as error:
             self._scale, self._reason = None, str(error)
             raise NotMetricError(self._reason) from error

@@ -1,45 +1,31 @@
-"""Metres and the map frame, from target boards seen in images of known pose.
+"""Metres: what boards, known distances and odometry say about the scale of the model, and what they say together.
 
-The model is what structure from motion gives: right up to a similarity. A board seen in several images is placed in
-the model by a similarity of its own; that similarity's factor is the scale, and the first board's frame makes the
-map's. Lengths in the model's unit end in nothing, metric ones in `_m`.
+Every source measures the scale on its own, with a standard deviation of its own, at the poses as they are. What the
+poses' errors do to it comes on top, with the covariance of the bundle adjustment: a board tells the size of the model
+where the board is, and the rest of the model is as much larger or smaller as the poses have drifted. The scale is
+therefore understood with respect to the whole trajectory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
-from pipeprog_camera.camera import Camera
-from pipeprog_sfm.board import Board, BoardObservation, identify_predicted, layouts, symmetries
+from pipeprog_sfm.board import Distance
 from pipeprog_sfm.config import BoardConfig
-from pipeprog_sfm.conic import FloatArray, circle_centre_images
-from pipeprog_sfm.ellipse import TargetEllipses
+from pipeprog_sfm.conic import FloatArray
+from pipeprog_sfm.placement import BoardPlacement, PlacedBoard, Sensitivity, cross_matrices
 
-# x to the right along the wall, y into it, z up (REP 103), for a board whose y axis points up.
-MAP_FROM_BOARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+# Of functions of the poses: (S, N, 6) derivatives, poses in order of time, -> (S, S).
+PoseCovariance = Callable[[FloatArray], FloatArray]
 
-# Errors as expected before any residual is seen, and how many residuals that knowledge is worth: of a centre from
-# fitted edges, and of a pose, in px at the board (its tie points, some 0.3 px each, are many).
-PRIOR_CENTRE = 0.03
-PRIOR_POSE = 0.1
-PRIOR_WEIGHT = 4.0
-
-PARTNERS = 6  # images that each image is paired with, near to far, to place a board
-CAUCHY = 2.385  # 95 % efficiency for normal errors
-CAUCHY_SQUARE = 0.630  # mean of weight times squared residual, of normal errors in two dimensions, over that without
-LARGEST_SIGMA = 0.01  # relative; a scale known worse than that is not published
-CONTRADICTION = 1e-4  # probability with which a sound board is taken for one that contradicts its file
+LARGEST_SIGMA = 0.05  # relative; a scale known worse than that is not published
 
 
 class NoScaleError(Exception):
-    """There is no scale; `reason` is "no_board", "too_few_views" or "contradiction", the text says more."""
+    """There is no scale; `reason` is one word with underscores, the text says more."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -47,30 +33,22 @@ class NoScaleError(Exception):
 
 
 @dataclass(frozen=True)
-class BoardPlacement:
-    """One board at one place of the model.
+class Measurement:
+    """The scale by one source.
 
     Attributes:
-        board: name of the board.
-        scale: metres per model unit by this board alone.
-        sigma: relative standard deviation of `scale`, from the images alone.
-        ratio_scale: the same by the paper's Eq. 2, the ratio of the spreads of given and triangulated centres.
-        model_from_board: (4, 4) similarity; takes metres to model units.
-        views: stamps of the images used [ns].
-        residuals_m: (N, 3) triangulated minus given centres in the board's frame, m; NaN for circles never seen twice.
-        residual_sigmas_m: (N, 3) their standard deviations, m.
-        residuals_px: (N,) root mean square reprojection error of each circle, px; NaN as above.
+        source: kind, as in pipeprog_msgs/SfmStatus.
+        name: for people.
+        log_scale: logarithm of metres per model unit.
+        sigma: standard deviation of `log_scale` at the given poses.
+        gradient: (N, 6) derivatives of `log_scale` by the poses in order of time, turned and shifted from the left.
     """
 
-    board: str
-    scale: float
+    source: str
+    name: str
+    log_scale: float
     sigma: float
-    ratio_scale: float
-    model_from_board: FloatArray
-    views: tuple[int, ...]
-    residuals_m: FloatArray
-    residual_sigmas_m: FloatArray
-    residuals_px: FloatArray
+    gradient: FloatArray
 
 
 @dataclass(frozen=True)
@@ -79,12 +57,13 @@ class ScaleEstimate:
 
     Attributes:
         scale: metres per model unit.
-        sigma: relative standard deviation of `scale`: images, the boards' own tolerance, and what boards disagree by.
-        source: what gave the scale.
-        views: stamps of all images used [ns].
-        map_from_model: (4, 4) similarity, linear part scale * R; `map` has its origin in the first board's, x to the
-            right along it, y into the wall and z up the board.
-        placements: every board at every place it was seen; the first one makes the frame.
+        sigma: relative standard deviation of `scale`, with respect to the size of the whole trajectory.
+        source: kinds of the sources, joined by "+".
+        views: stamps of the images in which boards were measured [ns].
+        map_from_model: (4, 4) similarity, linear part scale * R.
+        frame: where the map's origin is and what tells its z axis, for people.
+        placements: every board at every place it was seen, in that order.
+        measurements: what the scale is made of.
         warnings: what a person should look at, in full sentences.
     """
 
@@ -93,510 +72,112 @@ class ScaleEstimate:
     source: str
     views: tuple[int, ...]
     map_from_model: FloatArray
+    frame: str
     placements: tuple[BoardPlacement, ...]
+    measurements: tuple[Measurement, ...]
     warnings: tuple[str, ...]
 
 
-def estimate_scale(
-    observations: Mapping[int, Sequence[BoardObservation]],
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    boards: Sequence[Board],
-    config: BoardConfig,
-    ellipses: Mapping[int, TargetEllipses] | None = None,
-) -> ScaleEstimate:
-    """Metric scale and map frame from boards identified in images of known pose.
-
-    For every layout of boards a pair of images places it in the model, the other images vote, and the winner is
-    adjusted on all of them with robust weights; what is left over may be another board, or the same one elsewhere.
-    Given all ellipses of the images, boards of which only one or two circles are in view take part as well, since
-    their place is then predicted.
-
-    Args:
-        observations: boards seen, by image stamp [ns].
-        poses: (4, 4) camera_from_model by stamp, model units; images without a pose are left out.
-        camera: calibration.
-        boards: the boards of the file, in its order.
-        config: eccentricity, tolerance, upright.
-        ellipses: ellipses of the images, by stamp.
-
-    Raises:
-        NoScaleError: no board was seen, too few images saw it, or it contradicts its file.
-    """
-    if not boards:
-        raise NoScaleError("no_board", "no board file was given: hang up a board and name its file, for metres")
-    seen = {stamp: found for stamp, found in sorted(observations.items()) if found and stamp in poses}
-    if not seen:
-        names = ", ".join(board.name for board in boards)
-        raise NoScaleError("no_board", f"no board ({names}) was identified in any of {len(poses)} images with a pose")
-    placed: list[_Placed] = []
-    for group in layouts(boards):
-        views = [_View(stamp, found) for stamp, all_found in seen.items() for found in all_found]
-        views = [view for view in views if view.seen.board == group[0].name]
-        places = _places(views, poses, camera, group[0], config, ellipses)
-        for number, place in enumerate(sorted(places, key=lambda place: place.views[0].stamp)):
-            placed.append(replace(place, board=replace(group[min(number, len(group) - 1)])))
-    if not placed:
-        raise NoScaleError(
-            "too_few_views", f"a board was seen in {len(seen)} images, but from too few sides to be measured"
-        )
-    order = {board.name: number for number, board in enumerate(boards)}
-    placed.sort(key=lambda place: (order[place.board.name], place.views[0].stamp))
-    return _combine(placed, poses, camera, config)
-
-
 @dataclass(frozen=True)
-class _View:
-    stamp: int
-    seen: BoardObservation
+class Combined:
+    """One logarithm of the scale of many, its standard deviation, and who disagrees."""
 
-
-@dataclass(frozen=True)
-class _Rows:
-    """One row for each circle in each image: pixels, what made them, and the image's camera."""
-
-    pixels: FloatArray  # (M, 2)
-    circles: NDArray[np.intp]  # (M,)
-    groups: NDArray[np.intp]  # (M,) index of the image
-    rotations: FloatArray  # (M, 3, 3)
-    translations: FloatArray  # (M, 3)
-
-    def take(self, chosen: NDArray[np.bool_]) -> _Rows:
-        return _Rows(*(value[chosen] for value in vars(self).values()))
-
-
-@dataclass(frozen=True)
-class _Placed:
-    board: Board
-    views: tuple[_View, ...]
-    placement: FloatArray  # (4, 4) model_from_board
-    sigma: float  # relative, of the scale
-    centre_sigma: float  # px
-    pose_sigma: float  # px at the board
+    log_scale: float
+    sigma: float
+    warnings: tuple[str, ...]
 
     @property
     def scale(self) -> float:
-        return 1.0 / float(np.cbrt(np.linalg.det(self.placement[:3, :3])))
+        """Metres per model unit."""
+        return float(np.exp(self.log_scale))
 
 
-def _places(
-    views: list[_View],
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    board: Board,
-    config: BoardConfig,
-    ellipses: Mapping[int, TargetEllipses] | None,
-) -> list[_Placed]:
-    """Places of one layout in the model, each adjusted."""
-    places: list[_Placed] = []
-    while len(views) >= 2:
-        start, members = _consensus(views, poses, camera, board)
-        # Two images agree on almost anything: one place may rest on them, further ones need more.
-        if len(members) < (3 if places else 2):
-            break
-        chosen = [views[index] for index in members]
-        place = _adjusted(board, chosen, start, poses, camera, config)
-        if ellipses is not None:
-            place = _completed(place, poses, camera, config, ellipses)
-        taken = {(view.stamp, *centre) for view in place.views for centre in view.seen.ellipse_centres}
-        left = [view for index, view in enumerate(views) if index not in members]
-        views = [view for view in left if not any((view.stamp, *xy) in taken for xy in view.seen.ellipse_centres)]
-        if place.sigma <= LARGEST_SIGMA and (not places or abs(place.scale / places[0].scale - 1) < 0.05):
-            places.append(place)
-    return places
+def board_measurement(
+    place: PlacedBoard, inherited: Sensitivity, stamps: Sequence[int], config: BoardConfig
+) -> Measurement:
+    """The scale by one board: from the scatter of its images and the tolerance of its circles."""
+    sigma = float(np.hypot(place.sigma, config.tolerance / place.board.spread))
+    gradient = np.zeros((len(stamps), 6))
+    for stamp, derivative in inherited.derivatives.items():
+        gradient[stamps.index(stamp)] = -derivative[6]
+    return Measurement("board", f"board {place.board.name}", float(np.log(place.scale)), sigma, gradient)
 
 
-def _completed(
-    place: _Placed,
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    config: BoardConfig,
-    ellipses: Mapping[int, TargetEllipses],
-) -> _Placed:
-    """The place adjusted on every image in which a circle of the board is where it must be."""
-    views = []
-    for stamp in sorted(stamp for stamp in ellipses if stamp in poses):
-        camera_from_board = _metric(poses[stamp] @ place.placement, place.scale)
-        found = identify_predicted(ellipses[stamp], place.board, camera, camera_from_board)
-        if found is not None:
-            views.append(_View(stamp, found))
-    return _adjusted(place.board, views, place.placement, poses, camera, config) if len(views) >= 2 else place
-
-
-def _metric(camera_from_board: FloatArray, scale: float) -> FloatArray:
-    """Camera from board with both in metres, from the product of a pose and a similarity."""
-    metric = camera_from_board.copy()
-    metric[:3] *= scale
-    return metric
-
-
-def _consensus(
-    views: list[_View], poses: Mapping[int, FloatArray], camera: Camera, board: Board
-) -> tuple[FloatArray, list[int]]:
-    """The similarity model_from_board of the pair of images with which most others agree, and who agrees.
-
-    Views of a board that looks the same upside down are turned to agree before they are counted (in place).
-    """
-    orders = symmetries(board)
-    rows = _rows(views, poses, [view.seen.centres for view in views])
-    centres = np.array([-poses[view.stamp][:3, :3].T @ poses[view.stamp][:3, 3] for view in views])
-    limits = np.array([_agreement(view, camera, board) for view in views])[rows.groups]
-    best, best_score = np.eye(4), (0, 0.0)
-    best_inliers: NDArray[np.bool_] = np.zeros((len(orders), len(views)), bool)
-    for first in np.unique(np.linspace(0, len(views) - 1, 40).astype(int)):
-        # The far ones triangulate best, but may see an equal board elsewhere: the near ones see the same.
-        by_distance = np.argsort(np.linalg.norm(centres - centres[first], axis=1), kind="stable")[1:]
-        partners = by_distance[np.unique(np.linspace(0, len(by_distance) - 1, PARTNERS).astype(int))]
-        for partner, order in product(partners.tolist(), orders):
-            start = _from_pair(rows, int(first), partner, order, camera, board)
-            if start is None:
-                continue
-            errors = np.stack([_errors(rows, start, board, camera, turn[rows.circles]) for turn in orders])
-            inliers = np.stack([_all_in_group(error <= limits, rows.groups, len(views)) for error in errors])
-            score = (int(inliers.any(0).sum()), -float(np.minimum(errors.min(0), limits).sum()))
-            if score > best_score:
-                best, best_inliers, best_score = start, inliers, score
-    members = [int(index) for index in np.flatnonzero(best_inliers.any(0))]
-    for index in members:
-        turn = orders[best_inliers[:, index].argmax()]
-        found = views[index].seen
-        views[index] = replace(views[index], seen=replace(found, indices=turn[found.indices]))
-    return best, members
-
-
-def _agreement(view: _View, camera: Camera, board: Board) -> float:
-    """Reprojection error in px up to which an image agrees: a tenth of the radius, and never less than poses err."""
-    depth = view.seen.camera_from_board[2, 3]
-    return max(3.0, 0.1 * camera.fx * board.circle_radius / depth)
-
-
-def _all_in_group(good: NDArray[np.bool_], groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
-    return np.bincount(groups, ~good, count) == 0
-
-
-def _rows(views: Sequence[_View], poses: Mapping[int, FloatArray], pixels: Sequence[FloatArray]) -> _Rows:
-    groups = np.concatenate([np.full(len(view.seen.indices), index) for index, view in enumerate(views)])
-    stack = np.array([poses[view.stamp] for view in views])[groups]
-    circles = np.concatenate([view.seen.indices for view in views])
-    return _Rows(np.concatenate(pixels), circles, groups, stack[:, :3, :3], stack[:, :3, 3])
-
-
-def _from_pair(
-    rows: _Rows, first: int, second: int, order: NDArray[np.intp], camera: Camera, board: Board
-) -> FloatArray | None:
-    """model_from_board from the circles that two images share, or None where they do not give it."""
-    one, two = rows.take(rows.groups == first), rows.take(rows.groups == second)
-    common, in_one, in_two = np.intersect1d(one.circles, order[two.circles], return_indices=True)
-    if first == second or len(common) < 3:
+def distance_measurement(
+    distance: Distance, places: Mapping[str, tuple[PlacedBoard, Sensitivity]], stamps: Sequence[int]
+) -> Measurement | None:
+    """The scale by a measured distance between two circles, or None where their boards have no place."""
+    if not all(board in places for board, _ in distance.ends):
         return None
-    inverse = np.linalg.inv(camera.matrix)
-    rays, origins = [], []
-    for part, chosen in ((one, in_one), (two, in_two)):
-        rotations = part.rotations[chosen]
-        ray = np.einsum("nji,nj->ni", rotations, np.c_[part.pixels[chosen], np.ones(len(chosen))] @ inverse.T)
-        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-        origins.append(-np.einsum("nji,nj->ni", rotations, part.translations[chosen]))
-    cosine = np.einsum("ni,ni->n", *rays)
-    sine2 = 1 - cosine**2
-    if sine2.min() < np.sin(np.deg2rad(1.0)) ** 2:
-        return None
-    gap = origins[1] - origins[0]
-    along = [np.einsum("ni,ni->n", ray, gap) for ray in rays]
-    depths = ((along[0] - cosine * along[1]) / sine2, (cosine * along[0] - along[1]) / sine2)
-    if min(depth.min() for depth in depths) <= 0:
-        return None
-    points = 0.5 * sum(origin + depth[:, None] * ray for origin, depth, ray in zip(origins, depths, rays, strict=True))
-    return similarity(board.centres[common], points)
+    points, by_placement = [], []
+    for board, circle in distance.ends:
+        place, _ = places[board]
+        arm = place.placement[:3, :3] @ (place.board.centres[circle] - place.board.centres.mean(0))
+        points.append(place.placement[:3, :3] @ place.board.centres[circle] + place.placement[:3, 3])
+        by_placement.append(np.c_[-cross_matrices(arm[None])[0], np.eye(3), arm])
+    gap = points[1] - points[0]
+    length = float(np.linalg.norm(gap))
+    variance = (distance.sigma / distance.length) ** 2
+    gradient = np.zeros((len(stamps), 6))
+    for (board, _), derivative, sign in zip(distance.ends, by_placement, (-1.0, 1.0), strict=True):
+        row = sign * gap @ derivative / length**2
+        variance += float(row @ places[board][1].covariance @ row)
+        for stamp, by_pose in places[board][1].derivatives.items():
+            gradient[stamps.index(stamp)] -= row @ by_pose
+    log_scale = float(np.log(distance.length / length))
+    return Measurement("known_distance", f"the distance {distance.name}", log_scale, float(np.sqrt(variance)), gradient)
 
 
-def similarity(source: FloatArray, target: FloatArray) -> FloatArray:
-    """(4, 4) least-squares similarity target_from_source of (N, 3) points (Umeyama, 1991)."""
-    mean_source, mean_target = source.mean(0), target.mean(0)
-    centred = source - mean_source
-    left, values, right = np.linalg.svd((target - mean_target).T @ centred)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    linear = (left * signs) @ right * ((values * signs).sum() / (centred**2).sum())
-    transform = np.eye(4)
-    transform[:3, :3] = linear
-    transform[:3, 3] = mean_target - linear @ mean_source
-    return transform
+def combine(
+    measurements: Sequence[Measurement], poses: Mapping[int, FloatArray], covariance: PoseCovariance | None
+) -> Combined:
+    """The mean of all, weighted by their variances, with its standard deviation.
 
+    Sources that lean on the same poses err together, which the standard deviation counts; the weights do not, so that
+    none becomes negative. Where the sources disagree by more than they should, they are all trusted less (Birge 1932).
 
-def _project(rows: _Rows, points: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Pixels (M, 2) of model points (M, 3), and derivatives (M, 2, 3) by the points."""
-    x, y, z = (np.einsum("nij,nj->ni", rows.rotations, points) + rows.translations).T
-    z = np.where(z > 1e-9, z, 1e-9)
-    zero = np.zeros_like(z)
-    by_camera = np.stack(
-        [
-            np.stack([camera.fx / z, zero, -camera.fx * x / z**2], -1),
-            np.stack([zero, camera.fy / z, -camera.fy * y / z**2], -1),
-        ],
-        axis=1,
-    )
-    return np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], by_camera @ rows.rotations
-
-
-def _errors(rows: _Rows, placement: FloatArray, board: Board, camera: Camera, circles: NDArray[np.intp]) -> FloatArray:
-    points = board.centres[circles] @ placement[:3, :3].T + placement[:3, 3]
-    return np.linalg.norm(_project(rows, points, camera)[0] - rows.pixels, axis=1)
-
-
-def _adjusted(
-    board: Board,
-    views: Sequence[_View],
-    start: FloatArray,
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    config: BoardConfig,
-) -> _Placed:
-    """The placement adjusted on all views: seven parameters, robust weights, two variance components.
-
-    The residuals of one image share what an error of its pose does to them, so that five circles in one image are
-    not five independent witnesses: the covariance of an image is centre^2 I + pose^2 B B^T, where B holds the
-    derivatives by the camera's place, in px per px at the board.
+    Args:
+        measurements: one or more.
+        poses: (4, 4) camera_from_model by stamp, in order of time.
+        covariance: of functions of these poses; None takes them for exact.
     """
-    placement, centre, pose = start, PRIOR_CENTRE, PRIOR_POSE
-    for _ in range(4):
-        rows = _rows(views, poses, _pixels(views, placement, poses, camera, config))
-        for _ in range(6):
-            residuals, jacobian = _similarity_rows(rows, placement, board, camera)
-            noise = _noise(jacobian[:, :, 3:6], rows.groups, centre, pose)
-            white, white_jacobian = noise.whitened(residuals[..., None])[..., 0], noise.whitened(jacobian)
-            root = np.sqrt(_cauchy(white))[:, None]
-            flat, target = (white_jacobian * root[..., None]).reshape(-1, 7), (white * root).ravel()
-            change = np.linalg.lstsq(flat, -target, rcond=None)[0]
-            placement = _turned(placement, change, board)
-            if np.abs(change).max() < 1e-10:
-                break
-        sigma = float(np.sqrt(np.linalg.pinv(flat.T @ flat)[6, 6]))
-        components = centre, pose
-        centre, pose = _components(noise, target, flat)
-    return _Placed(board, tuple(views), placement, sigma, *components)
-
-
-def _pixels(
-    views: Sequence[_View],
-    placement: FloatArray,
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    config: BoardConfig,
-) -> list[FloatArray]:
-    """Images of the circles' centres, freed from eccentricity with the plane of the placement."""
-    if not config.eccentricity:
-        return [view.seen.ellipse_centres for view in views]
-    normal = placement[:3, 2] / np.linalg.norm(placement[:3, 2])
-    return [circle_centre_images(view.seen.conics, camera.matrix, poses[view.stamp][:3, :3] @ normal) for view in views]
-
-
-def _similarity_rows(rows: _Rows, placement: FloatArray, board: Board, camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Residuals (M, 2) and derivatives (M, 2, 7) by turn, shift and logarithm of size about the board's middle."""
-    middle = placement[:3, :3] @ board.centres.mean(0) + placement[:3, 3]
-    arms = (board.centres @ placement[:3, :3].T + placement[:3, 3] - middle)[rows.circles]
-    pixels, by_point = _project(rows, middle + arms, camera)
-    turns = np.zeros((len(arms), 3, 3))
-    x, y, z = arms.T
-    turns[:, 0, 1], turns[:, 0, 2], turns[:, 1, 2] = z, -y, x
-    turns[:, 1, 0], turns[:, 2, 0], turns[:, 2, 1] = -z, y, -x
-    by_size = by_point @ arms[..., None]
-    return pixels - rows.pixels, np.concatenate([by_point @ turns, by_point, by_size], axis=-1)
-
-
-def _turned(placement: FloatArray, change: FloatArray, board: Board) -> FloatArray:
-    """The placement changed by the seven parameters of `_similarity_rows`."""
-    centre = board.centres.mean(0)
-    middle = placement[:3, :3] @ centre + placement[:3, 3]
-    changed = np.eye(4)
-    changed[:3, :3] = np.exp(change[6]) * Rotation.from_rotvec(change[:3]).as_matrix() @ placement[:3, :3]
-    changed[:3, 3] = middle + change[3:6] - changed[:3, :3] @ centre
-    return changed
-
-
-@dataclass(frozen=True)
-class _Noise:
-    """Covariance of all rows: images are independent, centre^2 I + pose^2 B B^T each; U holds B's left directions."""
-
-    groups: NDArray[np.intp]
-    directions: FloatArray  # (M, 2, 3) U
-    shares: FloatArray  # (G, 3) part of the variance along each direction that is the pose's
-    centre: float
-    pose: float
-
-    def along(self, values: FloatArray) -> FloatArray:
-        """(G, 3, P) components of (M, 2, P) values along the directions."""
-        products = np.einsum("mik,mip->mkp", self.directions, values)
-        sums = np.zeros((len(self.shares), *products.shape[1:]))
-        np.add.at(sums, self.groups, products)
-        return sums
-
-    def whitened(self, values: FloatArray) -> FloatArray:
-        """(M, 2, P) rows times the inverse root of the covariance."""
-        shrink = self.along(values) * (np.sqrt(1.0 - self.shares) - 1.0)[..., None]
-        return (values + np.einsum("mik,mkp->mip", self.directions, shrink[self.groups])) / self.centre
-
-
-def _noise(by_place: FloatArray, groups: NDArray[np.intp], centre: float, pose: float) -> _Noise:
-    """Noise of rows whose derivatives by the camera's place (up to sign) are (M, 2, 3)."""
-    count = np.bincount(groups)
-    products = np.zeros((len(count), 3, 3))
-    np.add.at(products, groups, by_place.transpose(0, 2, 1) @ by_place)
-    values, vectors = np.linalg.eigh(products)
-    # Unit of the place: a shift of 1 px of all circles, the two larger of the three directions.
-    values = np.maximum(values, 1e-12 * values[:, 2:])
-    directions = by_place @ (vectors / np.sqrt(values)[:, None, :])[groups]
-    variances = pose**2 * values * (count / values[:, 2])[:, None]
-    # A single circle has two residuals: its third direction is nought and carries nothing.
-    shares = np.where(values > 1e-9 * values[:, 2:], variances / (variances + centre**2), 0.0)
-    return _Noise(groups, directions * (shares > 0)[groups][:, None, :], shares, centre, pose)
-
-
-def _cauchy(residuals: FloatArray) -> FloatArray:
-    """(M,) weights of whitened rows (M, 2)."""
-    return 1.0 / (1.0 + (residuals**2).sum(-1) / CAUCHY**2)
-
-
-def _components(noise: _Noise, residuals: FloatArray, jacobian: FloatArray) -> tuple[float, float]:
-    """Standard deviations of a centre and of a pose, px, from whitened, weighted residuals (2M,) and derivatives.
-
-    One step of restricted maximum likelihood: each residual counts for a component by its share of the variance,
-    less what the seven parameters absorb of it; the mean of the posterior that starts from the priors.
-    """
-    covariance = np.linalg.pinv(jacobian.T @ jacobian)
-    parts = noise.along(jacobian.reshape(-1, 2, 7))
-    absorbed = np.einsum("gki,ij,gkj->gk", parts, covariance, parts)
-    squares = noise.along(residuals.reshape(-1, 2, 1))[..., 0] ** 2
-    by_pose = float((noise.shares * squares).sum())
-    pose_freedom = max(float((noise.shares * (1.0 - absorbed)).sum()), 0.0)
-    by_centre = float(residuals @ residuals) - by_pose
-    centre_freedom = max(len(residuals) - 7 - pose_freedom, 0.0)
-    found = []
-    for prior, sigma, squared, freedom in (
-        (PRIOR_CENTRE, noise.centre, by_centre, centre_freedom),
-        (PRIOR_POSE, noise.pose, by_pose, pose_freedom),
-    ):
-        found.append(
-            np.sqrt((PRIOR_WEIGHT * prior**2 + sigma**2 * squared / CAUCHY_SQUARE) / (PRIOR_WEIGHT - 2.0 + freedom))
-        )
-    return float(found[0]), float(found[1])
-
-
-def _combine(
-    placed: list[_Placed], poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig
-) -> ScaleEstimate:
-    """One scale from all places, and the frame of the first."""
-    measured = [(place, _measured(place, poses, camera, config)) for place in placed]
-    faults = {id(place): _contradiction(place, result, config) for place, result in measured}
-    warnings = [text for text in faults.values() if text]
-    sound = [(place, result) for place, result in measured if not faults[id(place)]]
-    if not sound:
-        raise NoScaleError("contradiction", "; ".join(warnings))
-    sigmas = np.array([np.hypot(place.sigma, config.tolerance / place.board.spread) for place, _ in sound])
-    logs = np.log([place.scale for place, _ in sound])
-    weights = sigmas**-2 / (sigmas**-2).sum()
+    logs = np.array([one.log_scale for one in measurements])
+    joint = np.diag([one.sigma**2 for one in measurements])
+    if covariance is not None:
+        size = trajectory_gradient(poses)
+        joint = joint + covariance(np.stack([one.gradient + size for one in measurements]))
+    weights = 1.0 / np.diag(joint)
+    weights /= weights.sum()
     log_scale = float(weights @ logs)
-    sigma = float((sigmas**-2).sum() ** -0.5)
-    if len(sound) > 1:
-        # Boards that disagree by more than their sigmas show drift, which the common scale shares.
-        excess = float((((logs - log_scale) / sigmas) ** 2).sum() / (len(sound) - 1))
-        sigma *= max(1.0, excess) ** 0.5
-        for (place, _), log, own in zip(sound, logs, sigmas, strict=True):
-            if abs(log - log_scale) > 3 * own:
-                warnings.append(
-                    f"board {place.board.name} gives a scale {100 * (np.exp(log - log_scale) - 1):+.3f} % off the "
-                    f"common one, more than three of its sigmas ({100 * own:.3f} %): the map drifts, or a board is not "
-                    "as its file says"
-                )
-    first = sound[0][0]
-    frame, text = _map_frame(first, float(np.exp(log_scale)), poses, config)
-    warnings += [text] if text else []
-    stamps = sorted({view.stamp for place, _ in sound for view in place.views})
-    return ScaleEstimate(
-        float(np.exp(log_scale)),
-        sigma,
-        "board",
-        tuple(stamps),
-        frame,
-        tuple(result for _, result in sound),
-        tuple(warnings),
-    )
-
-
-def _map_frame(
-    place: _Placed, scale: float, poses: Mapping[int, FloatArray], config: BoardConfig
-) -> tuple[FloatArray, str]:
-    """(4, 4) map_from_model, and a warning or an empty text."""
-    board_axes = place.placement[:3, :3] / np.cbrt(np.linalg.det(place.placement[:3, :3]))
-    origin = place.placement[:3, 3]
-    up = -np.mean([poses[view.stamp][1, :3] for view in place.views], axis=0)
-    along = board_axes.T @ up
-    text = ""
-    if along[1] < 0 and len(symmetries(place.board)) > 1:
-        turn = np.diag([-1.0, -1.0, 1.0])
-        origin = origin + place.placement[:3, :3] @ (2 * place.board.centres.mean(0))
-        board_axes = board_axes @ turn
-    elif config.upright and along[1] < abs(along[0]):
-        tilt = abs(np.rad2deg(np.arctan2(along[0], along[1])))
-        text = (
-            f"board {place.board.name} hangs {tilt:.0f} degrees off upright as the camera was held, and the map's z "
-            "axis with it: hang it upright, or set upright to false"
+    sigma = float(np.sqrt(weights @ joint @ weights))
+    if sigma > LARGEST_SIGMA:
+        raise NoScaleError(
+            "too_uncertain",
+            f"the scale is known to {100 * sigma:.1f} % only: film the board from more sides, or measure a distance",
         )
-    frame = np.eye(4)
-    frame[:3, :3] = scale * MAP_FROM_BOARD @ board_axes.T
-    frame[:3, 3] = -frame[:3, :3] @ origin
-    return frame, text
+    warnings = []
+    if len(logs) > 1:
+        excess = (logs - log_scale) @ np.linalg.pinv(joint) @ (logs - log_scale) / (len(logs) - 1)
+        sigma *= max(1.0, float(excess)) ** 0.5
+        first = int(weights.argmax())
+        for index, one in enumerate(measurements):
+            spread = np.sqrt(joint[index, index] + joint[first, first] - 2 * joint[index, first])
+            gap = logs[index] - logs[first]
+            if abs(gap) > 3 * spread:
+                warnings.append(
+                    f"{one.name} gives a scale {100 * np.expm1(gap):+.3f} % off that of {measurements[first].name}, "
+                    f"more than three times their uncertainty ({100 * spread:.3f} %): one of them is not what it is "
+                    "said to be, or the map drifts"
+                )
+    return Combined(log_scale, sigma, tuple(warnings))
 
 
-def _measured(place: _Placed, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig) -> BoardPlacement:
-    """Every circle triangulated on its own, and what it says against the file."""
-    board, scale = place.board, place.scale
-    rows = _rows(place.views, poses, _pixels(place.views, place.placement, poses, camera, config))
-    residuals = np.full((len(board.centres), 3), np.nan)
-    sigmas, pixels = residuals.copy(), residuals[:, 0].copy()
-    noise = np.hypot(place.centre_sigma, place.pose_sigma)
-    to_metres = place.placement[:3, :3].T * scale**2  # its transpose is the rotation over the scale
-    points = np.full((len(board.centres), 3), np.nan)
-    for circle in range(len(board.centres)):
-        own = rows.take(rows.circles == circle)
-        if len(own.pixels) < 2:
-            continue
-        point = place.placement[:3, :3] @ board.centres[circle] + place.placement[:3, 3]
-        for _ in range(10):
-            projected, jacobian = _project(own, np.broadcast_to(point, (len(own.pixels), 3)), camera)
-            error = (projected - own.pixels) / noise
-            weights = np.sqrt(_cauchy(error))[:, None]
-            flat = (jacobian / noise * weights[..., None]).reshape(-1, 3)
-            change = np.linalg.lstsq(flat, -(error * weights).ravel(), rcond=1e-9)[0]
-            point = point + change
-        covariance = np.linalg.pinv(flat.T @ flat)
-        points[circle] = point
-        residuals[circle] = to_metres @ (point - place.placement[:3, 3]) - board.centres[circle]
-        sigmas[circle] = np.sqrt(np.diag(to_metres @ covariance @ to_metres.T))
-        pixels[circle] = np.sqrt(np.mean(((projected - own.pixels) ** 2).sum(1)))
-    known = ~np.isnan(residuals[:, 0])
-    spreads = [np.linalg.norm(xyz[known] - xyz[known].mean(0)) for xyz in (board.centres, points)]
-    return BoardPlacement(
-        board.name,
-        scale,
-        place.sigma,
-        float(spreads[0] / spreads[1]),
-        place.placement,
-        tuple(view.stamp for view in place.views),
-        residuals,
-        sigmas,
-        pixels,
-    )
-
-
-def _contradiction(place: _Placed, measured: BoardPlacement, config: BoardConfig) -> str:
-    """Why the board is refused, or an empty text: a circle off by more than its sigma and the tolerance allow."""
-    variance = measured.residual_sigmas_m**2 + config.tolerance**2
-    distance = (measured.residuals_m**2 / variance).sum(1)
-    known = ~np.isnan(distance)
-    if not (distance[known] > chi2.ppf(1 - CONTRADICTION, 3)).any():
-        return ""
-    offsets = 1000 * np.linalg.norm(measured.residuals_m, axis=1)
-    listed = ", ".join(f"{number + 1}: {offset:.2f} mm" for number, offset in enumerate(offsets) if known[number])
-    return (
-        f"board {place.board.name} contradicts its file (circles off by {listed}; they should be right to "
-        f"{1000 * config.tolerance:g} mm): measure its centres again, or check that it is flat and the file is its own"
-    )
+def trajectory_gradient(poses: Mapping[int, FloatArray]) -> FloatArray:
+    """(N, 6) derivatives of the logarithm of the trajectory's size (root of its summed squares about the mean)."""
+    stack = np.array(list(poses.values()))
+    rotation, translation = stack[:, :3, :3], stack[:, :3, 3]
+    centres = -np.einsum("nji,nj->ni", rotation, translation)
+    arms = centres - centres.mean(0)
+    rows = -np.einsum("nij,nj->ni", rotation, arms) / (arms**2).sum()  # of each centre, by the pose's shift
+    by_turn = np.einsum("ni,nij->nj", rows, cross_matrices(translation))
+    return np.concatenate([by_turn, rows], axis=1)

@@ -7,10 +7,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from targets import BOARD, CAMERA, LOPSIDED, camera_from_board, exact_ellipses, render
 
+from pipeprog_sfm.adjustment import adjust, function_covariance
 from pipeprog_sfm.board import Board, identify
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import BoardConfig
-from pipeprog_sfm.scale import NoScaleError, estimate_scale, similarity
+from pipeprog_sfm.metric import Evidence, estimate_scale
+from pipeprog_sfm.placement import similarity
+from pipeprog_sfm.scale import NoScaleError
 
 CONFIG = BoardConfig()
 AT_ORIGIN = (BOARD, np.eye(4))
@@ -44,7 +47,7 @@ class Walk:
 
     def estimate(self, boards=(BOARD,), config=CONFIG):
         seen = {stamp: identify(ellipses, boards, CAMERA) for stamp, ellipses in self.ellipses.items()}
-        return estimate_scale(seen, self.poses, CAMERA, boards, config, self.ellipses)
+        return estimate_scale(Evidence(boards, (), seen, self.ellipses), self.poses, CAMERA, config)
 
 
 @settings(max_examples=10, deadline=None)
@@ -162,7 +165,7 @@ def test_a_board_that_contradicts_its_file_is_refused_with_the_residuals(offset)
 def test_reasons_for_no_scale():
     walk = Walk(8)
     with pytest.raises(NoScaleError, match="no board file") as caught:
-        estimate_scale({}, walk.poses, CAMERA, [], CONFIG)
+        estimate_scale(Evidence(), walk.poses, CAMERA, CONFIG)
     with pytest.raises(NoScaleError, match="B") as caught:
         walk.estimate((LOPSIDED,))
     assert caught.value.reason == "no_board"
@@ -182,3 +185,63 @@ def test_tracker_measures_rendered_images():
         assert len(tracker.add(stamp, render(BOARD, pose, seed=stamp), CAMERA)) == 1
         poses[stamp] = walk.in_model(pose)
     assert tracker.estimate(poses).scale * walk.factor == pytest.approx(1.0, abs=5e-4)
+
+
+class DriftingWalk:
+    """A board at the beginning of a walk along a wall, whose poses come out of a bundle adjustment."""
+
+    def __init__(self, seed, track_noise=0.0, views=14, points=400):
+        rng = np.random.default_rng(seed)
+        xs = np.linspace(0.0, 4.0, views)
+        true = np.stack([camera_from_board((x, rng.normal(0, 0.1), 1.7 + rng.normal(0, 0.1)), (x, 0, 0)) for x in xs])
+        wall = rng.uniform([-1.5, -0.8, -0.6], [5.5, 0.8, 0.1], (points, 3))
+        inside = np.einsum("vij,pj->pvi", true[:, :3, :3], wall) + true[:, :3, 3]
+        pixels = inside[..., :2] / inside[..., 2:] * [CAMERA.fx, CAMERA.fy]
+        seen = (np.abs(pixels) < [CAMERA.width / 2, CAMERA.height / 2]).all(-1)
+        pixels += rng.normal(0, 0.3, pixels.shape)
+        # What the localisation of a feature depends on, the view angle, changes slowly along the walk.
+        pixels += (
+            track_noise * rng.normal(0, 1, (points, 1, 2)) * (xs[:, None] - wall[:, None, None, 0][..., 0, :, None])
+        )
+        seen[seen.sum(1) < 2] = False
+        wall, pixels, seen = wall[seen.any(1)], pixels[seen.any(1)], seen[seen.any(1)]
+        views_of_points = np.nonzero(seen)[1]
+        arrays = {
+            "start": np.append(0, np.cumsum(seen.sum(1))),
+            "view": views_of_points,
+            "rays": pixels[seen] / [CAMERA.fx, CAMERA.fy],
+            "focal": np.full((views, 2), CAMERA.fx),
+            "loss_scale": 2.385 * 0.3,
+        }
+        free = np.ones(views, bool)
+        free[0] = False
+        result = adjust(true[:, :3, :3], true[:, :3, 3], free, wall, **arrays, max_iterations=30, tolerance=1e-10)
+        self.poses = {}
+        for stamp in range(views):
+            self.poses[stamp] = true[stamp].copy()
+            self.poses[stamp][:3, :3], self.poses[stamp][:3, 3] = result.rotation[stamp], result.translation[stamp]
+        self.covariance = lambda gradients: function_covariance(
+            gradients, result.rotation, result.translation, result.points, **arrays
+        )
+        ellipses = {stamp: exact_ellipses([BOARD], [true[stamp]], noise=0.03, rng=rng) for stamp in range(views)}
+        seen_boards = {stamp: identify(found, (BOARD,), CAMERA) for stamp, found in ellipses.items()}
+        self.evidence = Evidence((BOARD,), (), seen_boards, ellipses)
+        found = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in self.poses.values()])
+        centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in true])
+        self.true_scale = np.cbrt(np.linalg.det(similarity(found, centres)[:3, :3]))
+
+    def score(self, covariance):
+        """Error of the scale over its standard deviation."""
+        config = replace(CONFIG, tolerance=0.0)
+        estimate = estimate_scale(self.evidence, self.poses, CAMERA, config, covariance)
+        return np.log(estimate.scale / self.true_scale) / estimate.sigma
+
+
+@pytest.mark.parametrize("track_noise", [0.0, 0.5])
+def test_sigma_holds_the_drift_away_from_the_board(track_noise):
+    """Chi-square over seeds; to take the poses for exact would be far off. The board itself is exact here."""
+    walks = [DriftingWalk(seed, track_noise) for seed in range(20)]
+    scores = np.array([walk.score(walk.covariance) for walk in walks])
+    assert 0.5 < np.mean(scores**2) < 2.0
+    assert np.abs(scores).max() < 3.5
+    assert np.mean([walk.score(None) ** 2 for walk in walks[:8]]) > 4.0
