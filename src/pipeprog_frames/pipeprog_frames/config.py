@@ -9,12 +9,30 @@ from dataclasses import dataclass, field
 class FramesConfig:
     """Which frames become keyframes."""
 
+    policy: str = field(
+        default="stream",
+        metadata={
+            "description": "stream chooses as the frames come, and corrects itself by the SfM's answers; network is "
+            "Algorithm 1 of the paper to the letter, over a whole recording (replay only)",
+            "unit": "",
+            "choices": ("stream", "network"),
+        },
+    )
     overlap_min: float = field(
         default=0.85,
         metadata={
             "description": "least overlap with the last keyframe (the paper's Ov_min)",
             "unit": "",
             "range": (0.3, 0.99),
+        },
+    )
+    overlap_band: float = field(
+        default=0.025,
+        metadata={
+            "description": "keyframes in a row whose overlap exceeds the least one by more than this are thinned out "
+            "(the paper's Ov_max - Ov_min)",
+            "unit": "",
+            "range": (0.001, 0.7),
         },
     )
     parallax_max: float = field(
@@ -36,7 +54,8 @@ class FramesConfig:
     buffer_mib: int = field(
         default=256,
         metadata={
-            "description": "memory for compressed frames that the feedback of the SfM may still call for",
+            "description": "memory for compressed frames that the feedback of the SfM may still call for; "
+            "a replay keeps them all, in a temporary file",
             "unit": "MiB",
             "range": (8, 4096),
         },

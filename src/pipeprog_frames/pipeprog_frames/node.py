@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from functools import partial
-from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -17,9 +17,12 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
-from pipeprog_frames.ring import Frame, FrameRing
-from pipeprog_frames.selector import DAMAGED, Decision, FrameSelector, Load
-from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray
+from pipeprog_frames.feedback import Tie
+from pipeprog_frames.network import Network
+from pipeprog_frames.ring import Frame, FrameFile, FrameRing
+from pipeprog_frames.selector import DAMAGED, Decision, Load
+from pipeprog_frames.stream import Stream
+from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import Diagnostics
@@ -31,26 +34,51 @@ LISTENERS = 2  # in lockstep: SfM and detector, without whom the first keyframe 
 MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
 
 
+class Policy(Protocol):
+    """What decides: Stream or Network."""
+
+    def consider(self, stamp: int, load: Load | None) -> list[Decision]:
+        """Takes the next frame."""
+
+    def flush(self) -> list[Decision]:
+        """Decides on the frames that are still open."""
+
+    def answer(self, ties: Iterable[Tie]) -> list[Decision]:
+        """Takes the SfM's answers."""
+
+    def settle(self) -> list[Decision]:
+        """What to change when all frames have come and the SfM has answered to all keyframes; nothing: the end."""
+
+    def verdict(self) -> list[Decision]:
+        """What is to be said of single keyframes in the end."""
+
+
 class FramesNode(Node):
-    """Adapter around FrameSelector."""
+    """Adapter around a Policy."""
 
     def __init__(self) -> None:
         super().__init__("frames")
         self._config = declare(self, FramesConfig)
+        if self._config.policy == "network" and not self._config.lockstep:
+            raise InputError("policy = network takes a whole recording: use it with `pipeprog replay`, live use stream")
         self._camera: Camera | None = None
-        self._selector: FrameSelector | None = None
-        self._ring = FrameRing(self._config.buffer_mib << 20)
+        self._policy: Policy | None = None
+        # In a replay the disk that holds the recording can hold its images, too.
+        self._ring = FrameFile() if self._config.lockstep else FrameRing(self._config.buffer_mib << 20)
         self._queue: deque[Image | CompressedImage] = deque()
-        self._keyframes: deque[Frame] = deque()  # chosen, not yet published
+        self._changes: deque[Frame | list[Decision]] = deque()  # keyframes to publish, keyframes to retire
         self._feedback: deque[ImageOverlapArray] = deque()
-        self._published: list[int] = []
-        self._acknowledged = 0
+        self._published: list[int] = []  # stamps in the order of publication
+        self._acknowledged = self._retirements = self._acknowledged_retirements = self._lag = 0
         self._considered = self._damaged = self._dropped = 0
         self._finish: tuple[int, Future] | None = None
+        self._flushed = False
+        self._frame_id = ""  # of the camera, as its last image says
 
         self._decisions = self.create_publisher(FrameDecision, "frame_decisions", qos.reliable(1000))
         self._images = self.create_publisher(CompressedImage, "keyframes/image/compressed", qos.reliable(50))
         self._infos = self.create_publisher(CameraInfo, "keyframes/camera_info", qos.reliable(50))
+        self._retired = self.create_publisher(KeyframesRetired, "keyframes/retired", qos.reliable(50))
         # Live, a late image is worth less than a fresh one; a recording must lose none.
         source = qos.reliable(MAX_QUEUE) if self._config.lockstep else qos.sensor(10)
         subscribe = partial(self.create_subscription, qos_profile=source, qos_overriding_options=qos.OVERRIDABLE)
@@ -76,8 +104,14 @@ class FramesNode(Node):
             return
         if camera != self._camera:
             self._camera = camera
-            self._selector = self._selector or FrameSelector(self._config, camera)
+            self._policy = self._policy or self._make_policy(camera)
         self._drain()
+
+    def _make_policy(self, camera: Camera) -> Policy:
+        overlap_min = self._config.overlap_min
+        if self._config.policy == "network":
+            return Network(overlap_min, overlap_min + self._config.overlap_band, self._ring.middle)
+        return Stream(self._config, camera, self._ring.middle)
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         self._queue.append(message)
@@ -103,12 +137,24 @@ class FramesNode(Node):
 
     def _on_overlap(self, message: ImageOverlapArray) -> None:
         self._acknowledged = max(self._acknowledged, message.keyframes_considered)
+        self._acknowledged_retirements = max(self._acknowledged_retirements, message.retirements_considered)
         self._feedback.append(message)
+        if not self._config.lockstep:
+            self._apply_feedback(message.keyframes_considered)
+            self._measure_lag(messages.stamp_ns(message.header.stamp))
         self._drain()
+
+    def _measure_lag(self, answered: int) -> None:
+        """How far the SfM is behind, by the keyframe that it has answered to: a count would not forgive a lost one."""
+        if answered in self._published:
+            self._lag = len(self._published) - 1 - self._published.index(answered)
+        if isinstance(self._policy, Stream):
+            self._policy.lag(self._lag)
 
     async def _on_finish(self, request: Finish.Request, response: Finish.Response) -> Finish.Response:
         done: Future = Future()
         self._finish = (request.expected_inputs, done)
+        self._flushed = False
         self._drain()
         await done
         response.success = bool(self._published)
@@ -118,28 +164,45 @@ class FramesNode(Node):
 
     def _drain(self) -> None:
         """Works off what can be worked off now; called on every arrival."""
-        while self._publish_keyframes() and self._queue and self._selector is not None:
+        while self._publish_changes() and self._queue and self._policy is not None:
             self._consider(self._queue.popleft())
-        if self._finish is None or self._considered < self._finish[0] or self._keyframes:
+        if self._finish is None or self._considered < self._finish[0]:
             return
-        if self._selector is not None:
-            self._decide(self._selector.flush())
-        if self._publish_keyframes() and self._acknowledged >= len(self._published):
+        if self._policy is not None and not self._flushed:
+            self._flushed = True
+            self._decide(self._policy.flush())
+        while self._publish_changes() and self._is_answered():
             self._apply_feedback(len(self._published))
-            if self._publish_keyframes() and self._acknowledged >= len(self._published):
-                done = self._finish[1]
-                self._finish = None
-                done.set_result(None)
+            decisions = self._policy.settle() if self._policy is not None else []
+            self._decide(decisions)
+            if not self._changes:
+                self._end()
+                return
+
+    def _end(self) -> None:
+        assert self._finish is not None
+        verdict = self._policy.verdict() if self._policy is not None else []
+        for decision in verdict:
+            self._announce(decision)
+        if verdict:
+            self.get_logger().info(f"{len(verdict)} keyframes are outside the band: frame_decisions has the reasons")
+        done = self._finish[1]
+        self._finish = None
+        done.set_result(None)
+
+    def _is_answered(self) -> bool:
+        return self._acknowledged >= len(self._published) and self._acknowledged_retirements >= self._retirements
 
     def _consider(self, message: Image | CompressedImage) -> None:
         assert self._camera is not None
-        assert self._selector is not None
+        assert self._policy is not None
         self._considered += 1
+        self._frame_id = message.header.frame_id
         stamp = messages.stamp_ns(message.header.stamp)
         encoded, load = self._open(message, self._camera)
         if encoded:
             self._ring.add(Frame(stamp, message.header.frame_id, encoded, self._camera))
-        self._decide(self._selector.consider(stamp, load if encoded else None))
+        self._decide(self._policy.consider(stamp, load if encoded else None))
 
     def _open(self, message: Image | CompressedImage, camera: Camera) -> tuple[bytes, Load]:
         """The image's compressed bytes (none: damaged), and what decodes it reduced and grey."""
@@ -168,68 +231,99 @@ class FramesNode(Node):
         return None
 
     def _decide(self, decisions: list[Decision]) -> None:
+        """Announces decisions and queues the changes that follow from them."""
+        retired = []
         for decision in decisions:
             self._damaged += decision.reason == DAMAGED
-            frame = self._ring.get(decision.stamp)
-            self._decisions.publish(
-                FrameDecision(
-                    header=messages.header(decision.stamp, frame.frame_id if frame else ""),
-                    chosen=decision.chosen,
-                    reason=decision.reason,
-                    overlap=float(decision.overlap),
-                    parallax=float(decision.parallax),
-                    sharpness=float(decision.sharpness),
-                )
-            )
-            if decision.chosen and frame is not None:
-                self._keyframes.append(frame)
+            self._announce(decision)
+            frame = self._ring.get(decision.stamp) if decision.chosen else None
+            if frame is not None:
+                self._changes.append(frame)
+            elif decision.stamp in self._published:
+                retired.append(decision)
+        if retired:
+            self._changes.append(retired)
 
-    def _publish_keyframes(self) -> bool:
-        """Publishes what is chosen; False while the SfM must catch up first (lockstep)."""
-        while self._keyframes:
+    def _announce(self, decision: Decision) -> None:
+        self._decisions.publish(
+            FrameDecision(
+                header=messages.header(decision.stamp, self._frame_id),
+                chosen=decision.chosen,
+                reason=decision.reason,
+                overlap=float(decision.overlap),
+                parallax=float(decision.parallax),
+                sharpness=float(decision.sharpness),
+            )
+        )
+
+    def _publish_changes(self) -> bool:
+        """Publishes what is chosen and retired; False while the SfM must catch up first (lockstep)."""
+        while self._changes:
             if self._config.lockstep:
                 if not self._published and not self._is_connected():
+                    return False
+                if self._acknowledged_retirements < self._retirements:
                     return False
                 if len(self._published) - self._acknowledged >= MAX_AHEAD:
                     return False
                 self._apply_feedback(len(self._published) + 1 - MAX_AHEAD)
+            change = self._changes.popleft()
+            if isinstance(change, Frame):
+                self._publish(change)
             else:
-                self._apply_feedback(len(self._published))
-            frame = self._keyframes.popleft()
-            self._published.append(frame.stamp)
-            self._images.publish(messages.compressed_image(frame.stamp, frame.frame_id, frame.encoded))
-            self._infos.publish(messages.info_from_camera(frame.camera, frame.stamp, frame.frame_id))
+                self._retire(change)
         return True
+
+    def _publish(self, frame: Frame) -> None:
+        self._published.append(frame.stamp)
+        self._images.publish(messages.compressed_image(frame.stamp, frame.frame_id, frame.encoded))
+        self._infos.publish(messages.info_from_camera(frame.camera, frame.stamp, frame.frame_id))
+
+    def _retire(self, decisions: list[Decision]) -> None:
+        self._retirements += 1
+        self._retired.publish(
+            KeyframesRetired(
+                header=messages.header(max(self._published), self._frame_id),
+                keyframes_published=len(self._published),
+                stamps=[messages.time_msg(decision.stamp) for decision in decisions],
+            )
+        )
 
     def _apply_feedback(self, count: int) -> None:
         """Uses the SfM's answers to the first `count` keyframes; later ones wait, so that a replay repeats itself."""
         while self._feedback and self._feedback[0].keyframes_considered <= count:
-            for image in self._feedback.popleft().images:
-                if not image.registered:
-                    self._bridge(messages.stamp_ns(image.stamp))
-
-    def _bridge(self, stamp: int) -> None:
-        """A keyframe that does not register gets a frame before and a frame after it (Algorithm 1)."""
-        keyframes = sorted({*self._published, *(frame.stamp for frame in self._keyframes)})
-        for first, second in pairwise(keyframes):
-            if stamp in (first, second):
-                frame = self._ring.middle(first, second)
-                if frame is not None:
-                    self._decide([Decision(frame.stamp, True, "bridges to a keyframe that did not register")])
+            ties = [_tie(image) for image in self._feedback.popleft().images]
+            if self._policy is not None:
+                self._decide(self._policy.answer(ties))
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         values = {
             "frames considered": self._considered,
             "keyframes": len(self._published),
+            "keyframes that the SfM is behind": self._lag,
             "damaged": self._damaged,
             "dropped": self._dropped,
             "queued": len(self._queue),
         }
         if self._camera is None:
             return DiagnosticStatus.WARN, "no usable CameraInfo yet", values
+        if isinstance(self._policy, Stream) and self._policy.overlap_min < self._config.overlap_min:
+            fewer = f"fewer keyframes, at an overlap of {self._policy.overlap_min:.2f}"
+            return DiagnosticStatus.WARN, f"the SfM cannot keep up: {fewer}", values
         if self._dropped:
             return DiagnosticStatus.WARN, "frames were dropped: the machine cannot keep up", values
         return DiagnosticStatus.OK, "selecting", values
+
+
+def _tie(image: ImageOverlap) -> Tie:
+    return Tie(
+        messages.stamp_ns(image.stamp),
+        image.registered,
+        image.overlap,
+        image.cell_overlap,
+        image.matches_previous,
+        image.matches_next,
+    )
 
 
 def main() -> None:

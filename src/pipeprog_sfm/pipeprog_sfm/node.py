@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+from std_msgs.msg import Header
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
@@ -24,7 +26,7 @@ from pipeprog_sfm.board import load_boards
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import FrameTie
 from pipeprog_sfm.reconstruction import MetricMap, Status
-from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, serve
+from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Retire, Retired, serve
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
 
@@ -41,6 +43,9 @@ class SfmNode(Node):
         self._images: dict[int, CompressedImage] = {}
         self._cameras: dict[int, tuple[str, Camera]] = {}
         self._frame_ids: dict[int, str] = {}
+        self._retirements: deque[msg.KeyframesRetired] = deque()  # to be applied after the keyframes before them
+        self._retiring: deque[msg.KeyframesRetired] = deque()  # at the worker
+        self._retired = 0
         self._seen = self._done = self._dropped = self._revision = 0
         self._last_stamp = self._map_stamp = 0
         self._status: Status | None = None
@@ -55,6 +60,7 @@ class SfmNode(Node):
             CompressedImage, "keyframes/image/compressed", self._on_image, qos.reliable(MAX_BACKLOG)
         )
         self.create_subscription(CameraInfo, "keyframes/camera_info", self._on_camera_info, qos.reliable(MAX_BACKLOG))
+        self.create_subscription(msg.KeyframesRetired, "keyframes/retired", self._on_retired, qos.reliable(MAX_BACKLOG))
         # In a group of its own: while it waits for the end, the other callbacks must run.
         self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
@@ -87,9 +93,20 @@ class SfmNode(Node):
         self._last_stamp = max(self._last_stamp, stamp)
         if self._worker.backlog >= MAX_BACKLOG:
             self._dropped += 1
-            return
-        self._worker.send(Keyframe(stamp, bytes(image.data), camera))
+        else:
+            self._worker.send(Keyframe(stamp, bytes(image.data), camera))
+        self._retire_when_due()
         self._finish_when_complete()
+
+    def _on_retired(self, message: msg.KeyframesRetired) -> None:
+        self._retirements.append(message)
+        self._retire_when_due()
+
+    def _retire_when_due(self) -> None:
+        while self._retirements and self._seen >= self._retirements[0].keyframes_published:
+            message = self._retirements.popleft()
+            self._retiring.append(message)
+            self._worker.send(Retire(tuple(messages.stamp_ns(stamp) for stamp in message.stamps)))
 
     async def _on_finish(self, request: srv.Finish.Request, response: srv.Finish.Response) -> srv.Finish.Response:
         done: Future = Future()
@@ -107,11 +124,14 @@ class SfmNode(Node):
             self._finish_sent = True
             self._worker.send(Finish())
 
-    def _on_event(self, event: KeyframeDone | MapReady | Finished) -> None:
+    def _on_event(self, event: KeyframeDone | Retired | MapReady | Finished) -> None:
         self._status = event.status
         if isinstance(event, KeyframeDone):
             self._done += 1
-            self._publish_overlap(event.stamp, event.ties)
+            self._publish_overlap(messages.header(event.stamp, self._frame_ids[event.stamp]), event.ties)
+        elif isinstance(event, Retired):
+            self._retired += 1
+            self._publish_overlap(self._retiring.popleft().header, event.ties)
         elif isinstance(event, MapReady):
             self._revision += 1
             self._publish_map(event.map)
@@ -124,11 +144,12 @@ class SfmNode(Node):
         self.get_logger().fatal(f"the reconstruction process died (exit code {exit_code}): the map is lost")
         raise SystemExit(1)
 
-    def _publish_overlap(self, stamp: int, ties: list[FrameTie]) -> None:
+    def _publish_overlap(self, header: Header, ties: list[FrameTie]) -> None:
         self._overlap.publish(
             msg.ImageOverlapArray(
-                header=messages.header(stamp, self._frame_ids[stamp]),
-                keyframes_considered=self._done,
+                header=header,
+                keyframes_considered=self._done + self._dropped,
+                retirements_considered=self._retired,
                 images=[
                     msg.ImageOverlap(
                         stamp=messages.time_msg(tie.stamp),

@@ -25,7 +25,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Retire:
-    """Command: take these keyframes out of the map; the next KeyframeDone tells what that has changed."""
+    """Command: take these keyframes out of the map."""
 
     stamps: tuple[int, ...]
 
@@ -40,6 +40,14 @@ class KeyframeDone:
     """Event: a keyframe is worked off."""
 
     stamp: int
+    status: Status
+    ties: list[FrameTie]
+
+
+@dataclass(frozen=True)
+class Retired:
+    """Event: a Retire is worked off."""
+
     status: Status
     ties: list[FrameTie]
 
@@ -78,6 +86,7 @@ def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board]) ->
                 _send_map(connection, reconstruction)
         elif isinstance(command, Retire):
             reconstruction.retire(command.stamps)
+            connection.send(Retired(reconstruction.status(), reconstruction.ties()))
         else:
             reconstruction.finish()
             problem = _send_map(connection, reconstruction)
