@@ -120,7 +120,11 @@ def _hypotheses(
         start = Cylinder(centres[number] - reach, centres[number] + reach, float(radii[number]))
         fit = fit_cylinder(points, across, start, 1.5 * sigma + 5e-4, along_ray=False)
         if fit is not None and radius_range[0] < fit.cylinder.radius < radius_range[1]:
-            found.append(Hypothesis(_densest(points[fit.inliers], fit.cylinder), int(fit.inliers.sum())))
+            found.append(
+                Hypothesis(
+                    _densest(points[fit.inliers], shape.count[good][fit.inliers], fit.cylinder), int(fit.inliers.sum())
+                )
+            )
     return found
 
 
@@ -133,13 +137,18 @@ def _alike(centres: FloatArray, axes: FloatArray, radii: FloatArray, number: int
     return np.asarray(same & (lateral < allowed) & (np.abs(radii - radii[number]) < allowed))
 
 
-def _densest(points: FloatArray, cylinder: Cylinder) -> Cylinder:
-    """The stretch of a diameter's length, at least 30 cm, that holds most of the sites: from there it is followed."""
-    along = np.sort((points - cylinder.start) @ cylinder.axis)
+def _densest(points: FloatArray, count: NDArray[np.int64], cylinder: Cylinder) -> Cylinder:
+    """The stretch of a diameter's length, at least 30 cm, around whose sites the cloud has most points.
+
+    From there, where it is dense and fine, the pipe is followed.
+    """
+    along = (points - cylinder.start) @ cylinder.axis
+    order = np.argsort(along, kind="stable")
+    along = along[order]
+    total = np.append(0, np.cumsum(count[order]))
     span = max(2.0 * cylinder.radius, 0.3)
-    count = np.searchsorted(along, along + span) - np.arange(len(along))
-    low = along[int(np.argmax(count))]
-    start = cylinder.start + low * cylinder.axis
+    within = total[np.searchsorted(along, along + span)] - total[:-1]
+    start = cylinder.start + along[int(np.argmax(within))] * cylinder.axis
     return Cylinder(start, start + span * cylinder.axis, cylinder.radius)
 
 
