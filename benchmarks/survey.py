@@ -39,6 +39,7 @@ def survey(
     """
     kept = results / f"survey_{name or recording.name}.json"
     if not kept.exists():
+        results.mkdir(parents=True, exist_ok=True)
         figures = measure(made(recording), overrides, RUNS / (name or recording.name))
         part = kept.with_suffix(".part")
         part.write_text(json.dumps(figures, indent=1) + "\n")
