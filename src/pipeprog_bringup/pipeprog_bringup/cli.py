@@ -116,6 +116,25 @@ def ingest(
     typer.echo(f"{ingested.frames} frames of {ingested.seconds:.1f} s: {out}")
 
 
+@app.command(rich_help_panel="To recordings")
+def board(
+    boards: Annotated[Path, typer.Argument(help="Target boards (YAML).", metavar="BOARD.yaml")],
+    paper: Annotated[str, typer.Option("--paper", help="A4, A3, A2, A1, A0, letter or tabloid.", metavar="SIZE")],
+    out: Annotated[Path, typer.Option("--out", help="The file to write.", metavar="BOARD.pdf")],
+    force: Annotated[bool, typer.Option("--force", help="Replace the file that --out names.")] = False,
+) -> None:
+    """Write target boards to print at true size, each with a ruler to check the print."""
+    from pipeprog_bringup.output import output_file
+    from pipeprog_sfm.board import load_boards
+    from pipeprog_sfm.board_print import board_pdf
+
+    pages = load_boards(boards)
+    document = board_pdf(pages, paper)
+    with output_file(out, force) as file:
+        file.write_bytes(document)
+    typer.echo(f"{len(pages)} page{'s' * (len(pages) > 1)}, to be printed at 100 %: {out}")
+
+
 @app.command(rich_help_panel="From results")
 def score(
     pipes: Annotated[Path, typer.Argument(help="pipes.json of a run.", metavar="DIR/pipes.json")],

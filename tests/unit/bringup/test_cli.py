@@ -15,6 +15,10 @@ import pytest
 from pipeprog_bringup.cloud_io import write_ply
 from tests.unit.bringup.recordings import write_bag
 
+BOARDS = """boards:
+  - {name: A, circle_radius_mm: 30, centres_mm: [[-130, 80], [130, 80], [40, 10], [-130, -80], [130, -80]]}
+  - {name: B, circle_radius_mm: 30, centres_mm: [[-130, 80], [130, 80], [-40, -10], [-130, -80], [130, -80]]}
+"""
 BOQ = "classes: [{name: DN65, outer_radius_mm: 36.5, planned_length_m: 3.0}]\n"
 
 
@@ -49,7 +53,7 @@ def test_help_is_instant() -> None:
         taken.append(min(time.perf_counter() - started, cpu))
         assert result.returncode == 0
     assert min(taken) < 0.5
-    for command in ("replay", "detect", "ingest", "score", "report"):
+    for command in ("replay", "detect", "ingest", "board", "score", "report"):
         assert command in result.stdout
 
 
@@ -85,7 +89,21 @@ def test_detect_writes_its_results_and_says_where(folder: Path) -> None:
     assert "pipes.json" in result.stdout
 
 
+def test_board_writes_a_page_for_each_board(folder: Path) -> None:
+    (folder / "boards.yaml").write_text(BOARDS)
+    result = pipeprog("board", "boards.yaml", "--paper", "A3", "--out", "boards.pdf", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    document = (folder / "boards.pdf").read_bytes()
+    assert document.startswith(b"%PDF-")
+    assert document.count(b"/Type /Page ") == 2
+    assert "boards.pdf" in result.stdout
+
+
 BAD = [
+    (("board", "absent.yaml", "--paper", "A3", "--out", "b.pdf"), "absent.yaml"),
+    (("board", "boards.yaml", "--paper", "A4", "--out", "b.pdf"), "does not fit on A4: print it on A3"),
+    (("board", "boards.yaml", "--paper", "B5", "--out", "b.pdf"), "paper 'B5' is unknown"),
+    (("board", "boards.yaml", "--paper", "A3", "--out", "boq.yaml"), "boq.yaml exists"),
     (("replay", "absent.mcap", "--boq", "boq.yaml", "--out", "out"), "no such bag: absent.mcap"),
     (("replay", "boq.yaml", "--boq", "boq.yaml", "--out", "out"), "boq.yaml is not an mcap file"),
     (("replay", "bag.mcap", "--boq", "absent.yaml", "--out", "out"), "absent.yaml"),
@@ -116,6 +134,7 @@ BAD = [
 @pytest.mark.parametrize(("arguments", "expected"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
 def test_bad_input_is_1_and_says_what_is_wrong(folder: Path, arguments: tuple[str, ...], expected: str) -> None:
     (folder / "bad.yaml").write_text("clases: []\n")
+    (folder / "boards.yaml").write_text(BOARDS)
     (folder / "used").mkdir()
     (folder / "used" / "mine.txt").write_text("keep")
     before = sorted(folder.rglob("*"))

@@ -8,7 +8,15 @@ from targets import BOARD, CAMERA, LOPSIDED, camera_from_board, exact_ellipses, 
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.board import Board, identify, identify_predicted, load_boards, symmetries
+from pipeprog_sfm.board import (
+    Board,
+    Distance,
+    identify,
+    identify_predicted,
+    load_boards,
+    load_distances,
+    symmetries,
+)
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.ellipse import TargetEllipses, find_ellipses
 
@@ -89,6 +97,38 @@ def test_a_missing_file_is_named(tmp_path):
         load_boards(tmp_path / "none.yaml")
 
 
+DISTANCE = "distances:\n  - {from: A/1, to: A/2, distance_mm: 480.2, sigma_mm: 0.5}\n"
+
+
+def test_reads_the_distances_of_a_file(tmp_path):
+    path = tmp_path / "board.yaml"
+    path.write_text(GOOD + DISTANCE)
+    (distance,) = load_distances(path, load_boards(path))
+    assert distance == Distance("A/1 to A/2", (("A", 0), ("A", 1)), 0.4802, 0.0005)
+    path.write_text(GOOD)
+    assert load_distances(path, load_boards(path)) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("A/2", "A/6", ["'to: A/6'", "A/1"]),
+        ("A/2", "B/1", ["B/1"]),
+        ("A/2", "A", ["BOARD/NUMBER"]),
+        ("A/2", "A/1", ["both ends"]),
+        ("sigma_mm: 0.5", "sigma_mm: 0", ["above zero"]),
+        ("sigma_mm", "sigma", ["sigma_mm"]),
+    ],
+)
+def test_refuses_a_bad_distance_and_says_why(tmp_path, old, new, words):
+    path = tmp_path / "board.yaml"
+    path.write_text(GOOD + DISTANCE.replace(old, new))
+    with pytest.raises(InputError, match="distance 1") as caught:
+        load_distances(path, load_boards(path))
+    for word in [*words, str(path)]:
+        assert word in str(caught.value)
+
+
 def test_symmetries():
     assert symmetries(BOARD).tolist() == [[0, 1, 2, 3, 4], [4, 3, 2, 1, 0]]
     assert symmetries(LOPSIDED).tolist() == [[0, 1, 2, 3, 4]]
@@ -125,8 +165,10 @@ def test_identity_from_geometry_in_clutter(x, y, z, roll, seed):
     pose = camera_from_board((x, y, z), (0, 0, 0), roll)
     true = exact_ellipses([LOPSIDED], [pose], noise=0.05, rng=rng)
     found = identify(joined(clutter(rng, 25), true), [BOARD, LOPSIDED], CAMERA)
-    assert [one.board for one in found] == ["B"]
-    assert found[0].centres == pytest.approx(images_of_centres(LOPSIDED, pose)[found[0].indices], abs=0.5)
+    # Three of 25 small ellipses look like a board in one image of fifty; the other images tell (test_scale).
+    (board,) = [one for one in found if len(one.indices) > 3]
+    assert board.board == "B"
+    assert board.centres == pytest.approx(images_of_centres(LOPSIDED, pose)[board.indices], abs=0.5)
 
 
 def test_clutter_alone_is_no_board():

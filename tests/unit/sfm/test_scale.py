@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from targets import BOARD, CAMERA, LOPSIDED, camera_from_board, exact_ellipses, render
 
 from pipeprog_sfm.adjustment import adjust, function_covariance
-from pipeprog_sfm.board import Board, identify
+from pipeprog_sfm.board import Board, Distance, identify
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.metric import Evidence, estimate_scale
@@ -45,9 +45,9 @@ class Walk:
         pose[:3, 3] = -pose[:3, :3] @ (self.model_from_board[:3, :3] @ centre + self.model_from_board[:3, 3])
         return pose
 
-    def estimate(self, boards=(BOARD,), config=CONFIG):
+    def estimate(self, boards=(BOARD,), config=CONFIG, distances=()):
         seen = {stamp: identify(ellipses, boards, CAMERA) for stamp, ellipses in self.ellipses.items()}
-        return estimate_scale(Evidence(boards, (), seen, self.ellipses), self.poses, CAMERA, config)
+        return estimate_scale(Evidence(boards, distances, seen, self.ellipses), self.poses, CAMERA, config)
 
 
 @settings(max_examples=10, deadline=None)
@@ -146,6 +146,51 @@ def test_an_image_with_a_wrong_pose_does_no_harm():
     estimate = walk.estimate()
     assert 4 not in estimate.views
     assert abs(estimate.scale * walk.factor - 1) < 5 * estimate.sigma
+
+
+def far_apart(seed, views=24):
+    left, right = np.eye(4), np.eye(4)
+    left[0, 3], right[0, 3] = -3.0, 3.0
+    boards = ((BOARD, left), (LOPSIDED, right))
+    return Walk(seed, views=views, noise=0.03, pose_noise=0.0003, span=7.0, follow=1.0, boards=boards)
+
+
+def test_a_known_distance_between_boards_sharpens_the_scale():
+    walk, length = far_apart(1), np.linalg.norm([6.0 + 0.06, 0.02])
+    distance = Distance("A/1 to B/1", (("A", 0), ("B", 0)), length, 0.0002)
+    alone, both = walk.estimate((BOARD, LOPSIDED)), walk.estimate((BOARD, LOPSIDED), distances=(distance,))
+    assert alone.source == "board"
+    assert both.source == "board+known_distance"
+    assert both.warnings == ()
+    assert both.sigma < 0.6 * alone.sigma
+    assert abs(both.scale * walk.factor - 1) < 3 * both.sigma
+
+
+def test_a_wrong_distance_is_told():
+    walk = far_apart(2)
+    distance = Distance("A/1 to B/1", (("A", 0), ("B", 0)), 5.9, 0.001)
+    estimate = walk.estimate((BOARD, LOPSIDED), distances=(distance,))
+    assert any("the distance A/1 to B/1" in text and "off" in text for text in estimate.warnings)
+    assert estimate.sigma > 3 * walk.estimate((BOARD, LOPSIDED)).sigma
+    lonely = Walk(2).estimate((BOARD, LOPSIDED), distances=(distance,))
+    assert "tells nothing" in lonely.warnings[0]
+
+
+def test_a_board_of_another_size_than_its_neighbour_is_told():
+    """Its file is of a print at 99 %: alone it could not be told, the other board contradicts it."""
+    walk = far_apart(3)
+    shrunk = Board("B", 0.99 * LOPSIDED.circle_radius, 0.99 * LOPSIDED.centres)
+    estimate = walk.estimate((BOARD, shrunk))
+    assert any("-1.0" in text or "+1.0" in text for text in estimate.warnings)
+
+
+def test_the_origin_stays_at_the_board_that_was_seen_first():
+    walk = far_apart(4)
+    for boards in ((BOARD, LOPSIDED), (LOPSIDED, BOARD)):
+        estimate = walk.estimate(boards)
+        assert estimate.placements[0].board == "A"
+        origin = estimate.map_from_model @ walk.model_from_board @ [-3.0, 0.0, 0.0, 1.0]
+        assert origin[:3] == pytest.approx(np.zeros(3), abs=0.002)
 
 
 def bent(offset):
