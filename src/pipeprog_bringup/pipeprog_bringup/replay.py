@@ -363,7 +363,8 @@ class _Run:
         self._moved = time.monotonic()
         self._answered = message.keyframes_considered
         for image in message.images:
-            self.log.overlap(messages.stamp_ns(image.stamp), image.overlap, image.registered)
+            stamp = messages.stamp_ns(image.stamp)
+            self.log.overlap(stamp, image.overlap, image.cell_overlap, image.registered)
 
     def _on_status(self, message: msg.SfmStatus) -> None:
         self._status = message

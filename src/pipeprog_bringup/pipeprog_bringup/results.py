@@ -26,7 +26,10 @@ from pipeprog_detect.pipe import Pipe
 
 FloatArray = NDArray[np.float64]
 
-FRAME_COLUMNS = ("stamp", "chosen", "reason", "overlap_n", "overlap_predicted", "parallax", "sharpness", "registered")
+FRAME_COLUMNS = (
+    *("stamp", "chosen", "reason", "overlap_n", "overlap_predicted", "parallax", "sharpness", "registered"),
+    "cell_overlap",
+)
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "pycolmap", "mcap", "ros-rclpy")
 
 
@@ -50,6 +53,7 @@ class FrameRow:
     parallax: float | None = None
     sharpness: float | None = None
     registered: bool | None = None
+    cell_overlap: float | None = None
 
 
 def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress], scale: Scale) -> None:
@@ -106,7 +110,8 @@ def write_frames(path: Path, rows: Iterable[FrameRow]) -> None:
             numbers = (row.overlap_n, row.overlap_predicted, row.parallax, row.sharpness)
             cells = ["" if value is None or not np.isfinite(value) else f"{value:.4f}" for value in numbers]
             registered = "" if row.registered is None else int(row.registered)
-            writer.writerow([row.stamp, int(row.chosen), row.reason, *cells, registered])
+            cell_overlap = "" if row.cell_overlap is None else f"{row.cell_overlap:.4f}"
+            writer.writerow([row.stamp, int(row.chosen), row.reason, *cells, registered, cell_overlap])
 
 
 def write_config(path: Path, config: dict[str, Any]) -> None:

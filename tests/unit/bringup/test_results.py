@@ -137,9 +137,9 @@ def test_a_second_decision_revokes_the_first() -> None:
     log.play(1)
     log.decide(row(1))
     log.decide(row(1, True, "bridges"))
-    log.overlap(1, 0.8, True)
-    log.overlap(1, 0.9, True)
-    assert log.rows() == [results.FrameRow(1, True, "bridges", overlap_n=0.9, registered=True)]
+    log.overlap(1, 0.8, 0.7, True)
+    log.overlap(1, 0.9, 0.75, True)
+    assert log.rows() == [results.FrameRow(1, True, "bridges", overlap_n=0.9, cell_overlap=0.75, registered=True)]
 
 
 def test_frames_of_one_stamp_each_get_a_decision() -> None:
