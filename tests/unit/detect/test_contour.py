@@ -59,6 +59,14 @@ def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[
     assert np.trace(fit.covariance[:2, :2]) > 1.5 * np.trace(clean.covariance[:2, :2])
 
 
+def test_the_ends_are_found_from_a_short_start(pipe_views: list[View]) -> None:
+    short = Cylinder(PIPE.start + 0.04 * PIPE.axis, PIPE.end - 0.04 * PIPE.axis, PIPE.radius)
+    fit = refine(short, 0.002, pipe_views, [], CONFIG)
+    assert fit is not None
+    # One pixel along the pipe, and what the rim is worth against it.
+    assert fit.cylinder.length == pytest.approx(PIPE.length, abs=3.5e-3)
+
+
 def test_a_catalogue_radius_does_not_pull(pipe_views: list[View]) -> None:
     free = refine(PIPE, 0.003, pipe_views, [], CONFIG)
     seeded = refine(PIPE, 0.003, pipe_views, [], CONFIG, planned_radii=(0.042, 0.0365))
