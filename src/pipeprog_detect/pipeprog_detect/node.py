@@ -32,7 +32,7 @@ from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
 
-MAX_PENDING = 4  # maps of which only a part has arrived
+MAX_PENDING = 16  # stamps of which only a part has arrived: poses come after each keyframe, maps now and then
 
 
 class DetectNode(Node):

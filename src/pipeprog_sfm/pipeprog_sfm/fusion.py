@@ -186,7 +186,7 @@ def _unpack(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([(keys >> (2 * _BITS)) & _MASK, (keys >> _BITS) & _MASK, keys & _MASK], axis=1) - _HALF
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _slot(table, keys, key):  # type: ignore[no-untyped-def]
     mask = len(table) - 1
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
@@ -196,7 +196,7 @@ def _slot(table, keys, key):  # type: ignore[no-untyped-def]
     return slot
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _insert(  # type: ignore[no-untyped-def]
     table, keys, sums, views, size, voxel, depth, normal, agreeing, color, matrix, map_from_camera
 ):
@@ -235,13 +235,13 @@ def _insert(  # type: ignore[no-untyped-def]
     return size
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _rehash(table, keys, size):  # type: ignore[no-untyped-def]
     for index in range(size):
         table[_slot(table, keys, keys[index])] = index
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _confirm(depth, others, matrix, other_matrices, others_from_view, agreement, agreeing_min):  # type: ignore[no-untyped-def]
     """Depth averaged with the views that agree, normals (camera frame, towards it), and how many agree (0: dropped).
 
@@ -294,7 +294,7 @@ def _confirm(depth, others, matrix, other_matrices, others_from_view, agreement,
     return fused, normals, agreeing
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _sample(depth, u, v, agreement):  # type: ignore[no-untyped-def]
     """Bilinear where the four pixels lie on one surface, else the nearest one; NaN outside."""
     height, width = depth.shape
@@ -309,7 +309,7 @@ def _sample(depth, u, v, agreement):  # type: ignore[no-untyped-def]
     return depth[int(v + 0.5), int(u + 0.5)]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _inverse_depth_plane(depth, u, v, agreement):  # type: ignore[no-untyped-def]
     """Least squares 1/z = a + b du + c dv over the pixels around that lie on the same surface; a = 0 where too few."""
     height, width = depth.shape

@@ -164,6 +164,10 @@ class SparseModel:
         ids, start = np.unique(owner, return_index=True)
         return ids, np.append(start, len(features)), features
 
+    def digests(self) -> NDArray[np.uint64]:
+        """(V,) hash of each view's points: another number when they have changed."""
+        return _digests(self.point_of, np.array(self.offsets))
+
     def covisible(self, view: int) -> IntArray:
         """(V,) number of points that each view shares with this one."""
         mine = self.point_of[self.features(view)]
@@ -200,6 +204,16 @@ class SparseModel:
             error = float(np.median(self.errors(features))) / RAYLEIGH_MEDIAN
             self.noise = min(max(error, NOISE_RANGE[0]), NOISE_RANGE[1])
         self.filter(ids, start, features)
+        if views is None:
+            self._forget_unseen()
+
+    def _forget_unseen(self) -> None:
+        """Numbers the points anew, without those that no view sees."""
+        alive = np.zeros(len(self.points), bool)
+        alive[self.point_of[self.point_of >= 0]] = True
+        number = np.append(np.cumsum(alive) - 1, NONE)  # NONE indexes the last one
+        self.point_of[:] = number[self.point_of]
+        self.points = self.points[alive]
 
     def covariance(self, gradients: FloatArray) -> FloatArray:
         """(S, S) covariance of functions of the poses whose derivatives are (S, V, 6): see `function_covariance`."""
@@ -241,6 +255,16 @@ def _error(rotation, translation, focal, x, y, z, u, v):  # type: ignore[no-unty
     du = (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]) / depth - u
     dv = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]) / depth - v
     return np.sqrt((focal[0] * du) ** 2 + (focal[1] * dv) ** 2)
+
+
+@njit(cache=True, nogil=True)
+def _digests(point_of, offsets):  # type: ignore[no-untyped-def]  # compiled
+    """FNV-1a over the points of each view, a word at a time."""
+    digests = np.full(len(offsets) - 1, 0xCBF29CE484222325, np.uint64)
+    for view in range(len(digests)):
+        for feature in range(offsets[view], offsets[view + 1]):
+            digests[view] = (digests[view] ^ np.uint64(point_of[feature] + 1)) * np.uint64(0x100000001B3)
+    return digests
 
 
 @njit(cache=True, nogil=True)

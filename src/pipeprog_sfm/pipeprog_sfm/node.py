@@ -25,8 +25,8 @@ from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.board import load_boards
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import FrameTie
-from pipeprog_sfm.reconstruction import MetricMap, Status
-from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Retire, Retired, serve
+from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
+from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Ready, Retire, Retired, serve
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
 
@@ -47,7 +47,8 @@ class SfmNode(Node):
         self._retiring: deque[msg.KeyframesRetired] = deque()  # at the worker
         self._retired = 0
         self._seen = self._done = self._dropped = self._revision = 0
-        self._last_stamp = self._map_stamp = 0
+        self._last_stamp = self._map_stamp = self._pose_stamp = 0
+        self._ready = False
         self._status: Status | None = None
         self._finish: tuple[int, Future] | None = None
         self._finish_sent = False
@@ -124,11 +125,16 @@ class SfmNode(Node):
             self._finish_sent = True
             self._worker.send(Finish())
 
-    def _on_event(self, event: KeyframeDone | Retired | MapReady | Finished) -> None:
+    def _on_event(self, event: Ready | KeyframeDone | Retired | MapReady | Finished) -> None:
+        if isinstance(event, Ready):
+            self._ready = True
+            return
         self._status = event.status
         if isinstance(event, KeyframeDone):
             self._done += 1
             self._publish_overlap(messages.header(event.stamp, self._frame_ids[event.stamp]), event.ties)
+            if event.trajectory is not None:
+                self._publish_poses(event.trajectory)
         elif isinstance(event, Retired):
             self._retired += 1
             self._publish_overlap(self._retiring.popleft().header, event.ties)
@@ -166,12 +172,17 @@ class SfmNode(Node):
             )
         )
 
+    def _publish_poses(self, trajectory: Trajectory) -> Header:
+        # No two differ by less than a nanosecond, so that the cloud and the poses of one map find each other.
+        self._pose_stamp = max(int(trajectory.stamps[-1]), self._pose_stamp + 1)
+        header = messages.header(self._pose_stamp, "map")
+        self._poses.publish(messages.path(header, trajectory.stamps, trajectory.map_from_camera))
+        return header
+
     def _publish_map(self, metric_map: MetricMap) -> None:
-        # Two maps of the same keyframes differ by a nanosecond, so that cloud and poses of one map find each other.
-        self._map_stamp = max(int(metric_map.stamps[-1]), self._map_stamp + 1)
-        header = messages.header(self._map_stamp, "map")
+        header = self._publish_poses(metric_map.trajectory)
+        self._map_stamp = self._pose_stamp
         cloud = metric_map.cloud
-        self._poses.publish(messages.path(header, metric_map.stamps, metric_map.map_from_camera))
         self._points.publish(
             messages.point_cloud(header, cloud.points, colors=cloud.colors, normals=cloud.normals, views=cloud.views)
         )
@@ -199,7 +210,7 @@ class SfmNode(Node):
         status = self._status
         values: dict[str, Any] = {"keyframes": self._seen, "waiting": self._worker.backlog, "dropped": self._dropped}
         if status is None:
-            return DiagnosticStatus.OK, "waiting for keyframes", values
+            return DiagnosticStatus.OK, "waiting for keyframes" if self._ready else "starting", values
         values |= {
             "registered": status.registered,
             "models": status.models,

@@ -49,7 +49,7 @@ def refine(
     return _smooth(inverse_depth, sigma, stride)[0], correlation, sigma
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
     """Inverse depth drawn to the plane around it as far as its sigma demands, and its (h, w, 2) derivatives.
 
@@ -94,7 +94,7 @@ def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
     return smooth, slant
 
 
-@njit(cache=True, parallel=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+@njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride):  # type: ignore[no-untyped-def]
     """Takes over the plane of a grid neighbour where it matches better, then one Gauss-Newton step of the depth."""
     height, width = inverse_depth.shape
@@ -171,7 +171,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
     return out, correlations, sigmas
 
 
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, warped, change, scores):  # type: ignore[no-untyped-def]
     """Mean correlation over the better half of the views, Gauss-Newton step of the inverse depth, sigma (0: unseen)."""
     one = np.float32(1.0)

@@ -51,7 +51,7 @@ class DepthMap:
 def choose_pairs(
     reference_stamp: int,
     poses: Mapping[int, FloatArray],
-    median_depth: Mapping[int, float],
+    median_depth: float,
     config: StereoConfig,
 ) -> list[int]:
     """Neighbours of a keyframe that are worth matching with it, best first, at most `max_pairs`.
@@ -62,21 +62,20 @@ def choose_pairs(
     """
     reference = poses[reference_stamp]
     rotation, centre = reference[:3, :3], _centre(reference)
-    candidates: list[tuple[int, float, FloatArray]] = []
-    for stamp in sorted(poses):
-        if stamp == reference_stamp:
-            continue
-        baseline = rotation @ (_centre(poses[stamp]) - centre)
-        length = float(np.linalg.norm(baseline))
-        ratio = length / median_depth[reference_stamp]
-        if not BASELINE_RATIO[0] <= ratio <= BASELINE_RATIO[1]:
-            continue
-        view_angle = float(np.arccos(np.clip(poses[stamp][2, :3] @ reference[2, :3], -1.0, 1.0)))
-        forward_angle = float(np.arcsin(min(1.0, abs(baseline[2]) / length)))
-        if view_angle > VIEW_ANGLE_MAX or forward_angle > FORWARD_MAX:
-            continue
-        cost = abs(np.log(ratio / BASELINE_RATIO_BEST)) + view_angle / VIEW_ANGLE_MAX + forward_angle / FORWARD_MAX
-        candidates.append((stamp, cost, baseline / length))
+    stamps = sorted(stamp for stamp in poses if stamp != reference_stamp)
+    if not stamps:
+        return []
+    stack = np.stack([poses[stamp] for stamp in stamps])
+    centres = -np.einsum("vji,vj->vi", stack[:, :3, :3], stack[:, :3, 3])
+    baselines = (centres - centre) @ rotation.T
+    lengths = np.maximum(np.linalg.norm(baselines, axis=1), 1e-12)
+    ratios = lengths / median_depth
+    view_angles = np.arccos(np.clip(stack[:, 2, :3] @ reference[2, :3], -1.0, 1.0))
+    forward_angles = np.arcsin(np.minimum(1.0, np.abs(baselines[:, 2]) / lengths))
+    fit = (ratios >= BASELINE_RATIO[0]) & (ratios <= BASELINE_RATIO[1])
+    fit &= (view_angles <= VIEW_ANGLE_MAX) & (forward_angles <= FORWARD_MAX)
+    costs = np.abs(np.log(ratios / BASELINE_RATIO_BEST)) + view_angles / VIEW_ANGLE_MAX + forward_angles / FORWARD_MAX
+    candidates = [(stamps[n], float(costs[n]), baselines[n] / lengths[n]) for n in np.flatnonzero(fit)]
     chosen: list[tuple[int, FloatArray]] = []
     while candidates and len(chosen) < config.max_pairs:
         # 1 for a baseline that repeats a chosen one, 0.5 for the opposite one, 0 for one at right angles to all
@@ -103,7 +102,7 @@ def depth_map(
     near, far = depth_range
     if not 0.0 < near < far:
         raise ValueError(f"depth range {near:g} to {far:g} is empty")
-    image, camera = _at_working_resolution(reference, config)
+    image, camera = working_image(reference.image, reference.camera, config.width)
     color = cv2.pyrDown(image)  # its pixel (u, v) is centred at (2 u, 2 v)
     height, width = color.shape[:2]
     grid = Camera(width, height, camera.fx / STRIDE, camera.fy / STRIDE, camera.cx / STRIDE, camera.cy / STRIDE)
@@ -112,7 +111,7 @@ def depth_map(
     gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
     others, homographies, epipoles = [], [], []
     for neighbour in neighbours:
-        other, other_camera = _at_working_resolution(neighbour, config)
+        other, other_camera = working_image(neighbour.image, neighbour.camera, config.width)
         others.append(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY).astype(np.float32))
         other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
         homographies.append(other_camera.matrix @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
@@ -146,9 +145,10 @@ def _centre(camera_from_world: FloatArray) -> FloatArray:
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
 
 
-def _at_working_resolution(view: StereoImage, config: StereoConfig) -> tuple[ByteImage, Camera]:
-    factor = config.width / view.camera.width
+def working_image(image: ByteImage, camera: Camera, width: int) -> tuple[ByteImage, Camera]:
+    """(H, W, 3) image of a pinhole camera, reduced to `width` if it is wider."""
+    factor = width / camera.width
     if factor >= 1.0:
-        return view.image, view.camera
-    camera = view.camera.scaled(factor)
-    return cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera
+        return image, camera
+    camera = camera.scaled(factor)
+    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera

@@ -59,7 +59,7 @@ def sweep(
     return (least + step * index).astype(np.float32)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _census(image, stride):  # type: ignore[no-untyped-def]
     """Bit string of a pixel: which pixels around it, `stride` apart, are darker. 0 at the border: unknown."""
     height, width = image.shape
@@ -76,7 +76,7 @@ def _census(image, stride):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, parallel=True, fastmath=True, error_model="numpy")
 def _cost_volume(census, others, homographies, epipoles, least, step, count):  # type: ignore[no-untyped-def]
     """(h, w, count) uint8: sum of the two best views' Hamming distances, so that one occluded side does no harm."""
     height, width = census.shape
@@ -115,7 +115,7 @@ def _cost_volume(census, others, homographies, epipoles, least, step, count):  #
     return costs
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _aggregate(costs, penalty_small, penalty_large):  # type: ignore[no-untyped-def]
     """(2, h, w, D) uint16: path costs from above (left, upper left, up, upper right) and, mirrored, from below."""
     height, width, count = costs.shape
@@ -176,7 +176,7 @@ def _extend(cost, path, least, out, penalty_small, penalty_large):  # type: igno
     out[last] = np.uint16(cost[last] + min(min(path[last], np.uint16(path[last - 1] + small)), jump) - least)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _best(sums):  # type: ignore[no-untyped-def]
     """(h, w) float32 index of the least sum, refined between its two neighbours; NaN at either end of the range."""
     _, height, width, count = sums.shape

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -11,7 +13,11 @@ from pipeprog_camera.errors import InputError
 from pipeprog_sfm.board import Board
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import FrameTie
-from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status
+from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
+from pipeprog_sfm.warm_up import warm_up
+
+IDLE_SECONDS = 1.0  # without a command, after which a map goes out early: nobody knows when the next keyframe comes
+POLL_SECONDS = 0.1  # between looks at the map under way
 
 
 @dataclass(frozen=True)
@@ -36,12 +42,18 @@ class Finish:
 
 
 @dataclass(frozen=True)
+class Ready:
+    """Event: keyframes are worked off without delay from now on."""
+
+
+@dataclass(frozen=True)
 class KeyframeDone:
-    """Event: a keyframe is worked off."""
+    """Event: a keyframe is worked off; the trajectory is None while there is no scale."""
 
     stamp: int
     status: Status
     ties: list[FrameTie]
+    trajectory: Trajectory | None
 
 
 @dataclass(frozen=True)
@@ -70,34 +82,50 @@ class Finished:
 
 def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board]) -> None:
     """Works off commands from `connection` until it closes."""
+    warm_up(config)
+    connection.send(Ready())
     reconstruction = Reconstruction(config, boards)
-    since_map = 0
+    since_map, idle_since = 0, time.monotonic()
     while True:
-        command = connection.recv()
-        if isinstance(command, Keyframe):
-            try:
-                reconstruction.add(command.stamp, command.encoded, command.camera)
-            except InputError as error:
-                reconstruction.skip(command.stamp, str(error))
-            connection.send(KeyframeDone(command.stamp, reconstruction.status(), reconstruction.ties()))
-            since_map += 1
-            if since_map >= config.map_interval and not connection.poll():
-                since_map = 0
-                _send_map(connection, reconstruction)
-        elif isinstance(command, Retire):
-            reconstruction.retire(command.stamps)
-            connection.send(Retired(reconstruction.status(), reconstruction.ties()))
-        else:
-            reconstruction.finish()
-            problem = _send_map(connection, reconstruction)
-            connection.send(Finished(reconstruction.status(), problem))
+        busy = since_map > 0 or reconstruction.is_mapping
+        if connection.poll(POLL_SECONDS if busy else None):
+            command = connection.recv()
+            if isinstance(command, Finish):
+                connection.send(_finish(connection, reconstruction))
+                continue
+            if isinstance(command, Keyframe):
+                connection.send(_add(reconstruction, command))
+                reconstruction.update_dense()  # once the pose is out
+                since_map += 1
+            else:
+                reconstruction.retire(command.stamps)
+                connection.send(Retired(reconstruction.status(), reconstruction.ties()))
+            idle_since = time.monotonic()
+        metric_map = reconstruction.finished_map()
+        if metric_map is not None:
+            connection.send(MapReady(reconstruction.status(), metric_map))
+        idle = since_map > 0 and time.monotonic() - idle_since > IDLE_SECONDS
+        if not reconstruction.is_mapping and (since_map >= config.map_interval or idle):
+            since_map = 0
+            with contextlib.suppress(NotMetricError):  # the status tells
+                reconstruction.request_map()
 
 
-def _send_map(connection: Connection, reconstruction: Reconstruction) -> str:
-    """Sends the map, or returns why there is none."""
+def _add(reconstruction: Reconstruction, keyframe: Keyframe) -> KeyframeDone:
     try:
-        metric_map = reconstruction.metric_map()
+        reconstruction.add(keyframe.stamp, keyframe.encoded, keyframe.camera)
+    except InputError as error:
+        reconstruction.skip(keyframe.stamp, str(error))
+    trajectory = None
+    with contextlib.suppress(NotMetricError):  # the status tells
+        trajectory = reconstruction.trajectory()
+    return KeyframeDone(keyframe.stamp, reconstruction.status(), reconstruction.ties(), trajectory)
+
+
+def _finish(connection: Connection, reconstruction: Reconstruction) -> Finished:
+    try:
+        metric_map = reconstruction.finish()
     except NotMetricError as error:
-        return str(error)
+        return Finished(reconstruction.status(), str(error))
     connection.send(MapReady(reconstruction.status(), metric_map))
-    return ""
+    return Finished(reconstruction.status(), "")

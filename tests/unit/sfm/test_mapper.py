@@ -126,7 +126,7 @@ def test_ties_are_told_once_and_again_when_they_change() -> None:
 
 def test_the_same_keyframes_give_the_same_bytes() -> None:
     (first, _), (second, _) = walk(np.arange(0, 1.2, 0.2)), walk(np.arange(0, 1.2, 0.2))
-    assert first.depths(STEP).tobytes() == second.depths(STEP).tobytes()
+    assert first.points_seen(STEP).tobytes() == second.points_seen(STEP).tobytes()
     for stamp, camera_from_model in first.camera_from_model().items():
         assert camera_from_model.tobytes() == second.camera_from_model()[stamp].tobytes()
 

@@ -143,14 +143,14 @@ def test_pairs_stand_beside_not_in_front_and_look_the_same_way():
         5: pose([1.5, 0, 0]),  # too far
         6: pose([0.4, 0.02, 0], [0, 1.2, 0]),  # looks elsewhere
     }
-    chosen = choose_pairs(0, poses, {stamp: 2.0 for stamp in poses}, StereoConfig(max_pairs=8))
+    chosen = choose_pairs(0, poses, 2.0, StereoConfig(max_pairs=8))
     assert sorted(chosen) == [1, 2]
 
 
 def test_pairs_of_different_direction_come_first():
     centres = [[0, 0, 0], [0.4, 0, 0], [0.42, 0, 0], [0.38, 0, 0], [-0.4, 0, 0], [0, 0.45, 0]]
     poses = {stamp: pose(centre) for stamp, centre in enumerate(centres)}
-    assert sorted(choose_pairs(0, poses, {0: 2.0}, StereoConfig(max_pairs=3))) == [1, 4, 5]
+    assert sorted(choose_pairs(0, poses, 2.0, StereoConfig(max_pairs=3))) == [1, 4, 5]
 
 
 @settings(max_examples=25, deadline=None)
@@ -163,4 +163,4 @@ def test_pairs_do_not_depend_on_the_frame_or_unit_of_the_world(seed, scale):
     for stamp, matrix in poses.items():
         others[stamp] = matrix @ moved
         others[stamp][:3, 3] *= scale
-    assert choose_pairs(0, poses, {0: 2.0}, CONFIG) == choose_pairs(0, others, {0: 2.0 * scale}, CONFIG)
+    assert choose_pairs(0, poses, 2.0, CONFIG) == choose_pairs(0, others, 2.0 * scale, CONFIG)

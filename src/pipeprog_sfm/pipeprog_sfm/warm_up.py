@@ -1,0 +1,36 @@
+"""Loads (the first time: compiles) what Numba compiles, before the first keyframe has to wait for it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.fusion import fuse
+from pipeprog_sfm.reconstruction import Reconstruction
+from pipeprog_sfm.stereo import StereoImage, depth_map
+
+SIZE = (320, 240)
+DEPTHS = (0.7, 1.5)
+STEP = 24  # px between two views of a wall at 1 m
+
+
+def warm_up(config: SfmConfig) -> None:
+    """Runs each stage on five views of a plane, which takes about a second."""
+    width, height = SIZE
+    camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2)
+    wall = np.random.default_rng(0).integers(0, 256, (height // 4, width), np.uint8)
+    wall = cv2.resize(wall, (4 * width, height), interpolation=cv2.INTER_CUBIC)
+    reconstruction = Reconstruction(config, [])
+    views = []
+    for number in range(5):
+        gray = np.ascontiguousarray(wall[:, number * STEP :][:, :width])
+        image = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
+        pose = np.eye(4)
+        pose[0, 3] = -number * STEP / camera.fx
+        views.append(StereoImage(number, image, camera, pose))
+        reconstruction.add(number, cv2.imencode(".png", image)[1].tobytes(), camera)
+        reconstruction.ties()
+    maps = [depth_map(view, [other for other in views if other is not view], DEPTHS, config.stereo) for view in views]
+    fuse(maps, {view.stamp: view.camera_from_world for view in views}, 1.0, config.fusion)
