@@ -1,4 +1,4 @@
-"""Boards over a stream of keyframes: look once at each image, estimate whenever the poses move."""
+"""Boards and motion over a stream of keyframes: look once at each image, estimate whenever the poses move."""
 
 from __future__ import annotations
 
@@ -9,32 +9,45 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.board import Board, BoardObservation, Distance, identify
-from pipeprog_sfm.config import BoardConfig
+from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses, find_ellipses
 from pipeprog_sfm.metric import Evidence, estimate_scale
+from pipeprog_sfm.motion import Acceleration, Motion, TransformTree
 from pipeprog_sfm.scale import NoScaleError, PoseCovariance, ScaleEstimate
 
 
 class BoardTracker:
-    """Keeps the ellipses and the identified boards of every keyframe; the images themselves are not kept."""
+    """Keeps the ellipses and the identified boards of every keyframe, not the images, and what a robot's motion was."""
 
-    def __init__(self, boards: Sequence[Board], config: BoardConfig, distances: Sequence[Distance] = ()) -> None:
+    def __init__(
+        self,
+        boards: Sequence[Board],
+        config: BoardConfig,
+        distances: Sequence[Distance] = (),
+        odometry: OdometryConfig = OdometryConfig(),  # noqa: B008  # frozen
+    ) -> None:
         self._boards = tuple(boards)
         self._distances = tuple(distances)
         self._config = config
+        self._odometry = odometry
         self._camera: Camera | None = None
+        self._frame = ""
         self._ellipses: dict[int, TargetEllipses] = {}
         self._observations: dict[int, list[BoardObservation]] = {}
+        self._transforms = TransformTree()
+        self._accelerations: list[Acceleration] = []
 
-    def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera) -> list[BoardObservation]:
+    def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera, frame: str = "") -> list[BoardObservation]:
         """Looks for boards in the keyframe of `stamp` [ns] and returns those that it identifies.
 
         Args:
             stamp: time of the keyframe [ns].
             gray: (H, W) uint8 image as the camera saw it: edges are measured before the lens distortion is removed.
             camera: calibration, the same for every keyframe.
+            frame: name of the camera's optical frame.
         """
+        self._frame = frame
         self._camera = camera
         ellipses = find_ellipses(gray, camera, self._config)
         found = identify(ellipses, self._boards, camera)
@@ -43,6 +56,11 @@ class BoardTracker:
         if found:
             self._observations[stamp] = found
         return found
+
+    def move(self, motion: Motion) -> None:
+        """Takes what odometry, TF and IMU have told since the last call."""
+        self._transforms.add(motion.transforms)
+        self._accelerations += motion.accelerations
 
     def retire(self, stamps: Iterable[int]) -> None:
         """Forgets keyframes [ns]; unknown ones are ignored."""
@@ -54,5 +72,13 @@ class BoardTracker:
         """Scale and map frame for (4, 4) poses camera_from_model by stamp; raises NoScaleError with the reason."""
         if self._camera is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
-        evidence = Evidence(self._boards, self._distances, self._observations, self._ellipses)
-        return estimate_scale(evidence, poses, self._camera, self._config, covariance)
+        evidence = Evidence(
+            self._boards,
+            self._distances,
+            self._observations,
+            self._ellipses,
+            self._transforms,
+            self._accelerations,
+            self._frame,
+        )
+        return estimate_scale(evidence, poses, self._camera, self._config, self._odometry, covariance)

@@ -42,6 +42,20 @@ class BoardConfig:
 
 
 @dataclass(frozen=True)
+class OdometryConfig:
+    """Scale by odometry."""
+
+    scale_sigma: float = field(
+        default=0.01,
+        metadata={
+            "description": "relative standard deviation of the lengths that odometry tells, as it is calibrated",
+            "unit": "",
+            "range": (0.0, 0.2),
+        },
+    )
+
+
+@dataclass(frozen=True)
 class StereoConfig:
     """Depth maps."""
 
@@ -94,5 +108,6 @@ class SfmConfig:
     )
     mapper: MapperConfig = field(default_factory=MapperConfig)
     board: BoardConfig = field(default_factory=BoardConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)

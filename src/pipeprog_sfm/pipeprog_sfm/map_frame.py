@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeprog_sfm.board import symmetries
 from pipeprog_sfm.conic import FloatArray
+from pipeprog_sfm.motion import Path
 from pipeprog_sfm.placement import PlacedBoard
 
 STEEPEST = np.cos(np.radians(30.0))  # an axis nearer to the vertical tells no heading
@@ -40,6 +41,16 @@ def board_vertical(place: PlacedBoard, poses: Mapping[int, FloatArray]) -> tuple
             "axis with it: hang it upright, or set upright to false"
         )
     return place, Vertical(axes[:, 1], f"board {place.board.name}"), text
+
+
+def path_vertical(path: Path, poses: Mapping[int, FloatArray]) -> Vertical:
+    """The z axis of the frame that odometry moves in, which REP 103 has up."""
+    ups = [
+        poses[int(stamp)][:3, :3].T @ pose[2, :3]
+        for stamp, pose in zip(path.stamps, path.fixed_from_camera, strict=True)
+    ]
+    up = np.mean(ups, axis=0)
+    return Vertical(up / np.linalg.norm(up), f"frame '{path.fixed}'")
 
 
 def camera_up(poses: Mapping[int, FloatArray]) -> FloatArray:

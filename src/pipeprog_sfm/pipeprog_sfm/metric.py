@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.board import Board, BoardObservation, Distance
-from pipeprog_sfm.config import BoardConfig
+from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses
-from pipeprog_sfm.map_frame import Vertical, board_vertical, map_from_model
+from pipeprog_sfm.gravity import GravityError, gravity
+from pipeprog_sfm.map_frame import Vertical, board_vertical, map_from_model, path_vertical
+from pipeprog_sfm.motion import Acceleration, NoPathError, TransformTree
+from pipeprog_sfm.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.placement import BoardPlacement, PlacedBoard, contradiction, measure, place_boards, sensitivity
 from pipeprog_sfm.scale import (
     Measurement,
@@ -25,19 +30,25 @@ from pipeprog_sfm.scale import (
 
 @dataclass(frozen=True)
 class Evidence:
-    """What was seen of targets.
+    """What was seen of targets, and what a robot told of its motion.
 
     Attributes:
         boards: the boards of the file.
         distances: measured distances between their circles.
         observations: boards seen, by image stamp [ns].
         ellipses: all ellipses of the images, by stamp: boards of which only a circle is in view take part, too.
+        transforms: odometry and TF.
+        accelerations: of an IMU.
+        camera_frame: name of the camera's optical frame.
     """
 
     boards: Sequence[Board] = ()
     distances: Sequence[Distance] = ()
     observations: Mapping[int, Sequence[BoardObservation]] = field(default_factory=dict)
     ellipses: Mapping[int, TargetEllipses] | None = None
+    transforms: TransformTree = field(default_factory=TransformTree)
+    accelerations: Sequence[Acceleration] = ()
+    camera_frame: str = ""
 
 
 def estimate_scale(
@@ -45,40 +56,73 @@ def estimate_scale(
     poses: Mapping[int, FloatArray],
     camera: Camera,
     config: BoardConfig,
+    odometry: OdometryConfig = OdometryConfig(),  # noqa: B008  # frozen
     covariance: PoseCovariance | None = None,
 ) -> ScaleEstimate:
     """Metric scale and map frame of a model.
 
     Args:
-        evidence: what tells the scale.
+        evidence: what tells the scale and the vertical.
         poses: (4, 4) camera_from_model by stamp in order of time, model units; images without a pose are left out.
         camera: calibration.
         config: eccentricity, tolerance, upright.
+        odometry: how good odometry is.
         covariance: of functions of the poses; None takes these for exact.
 
     Raises:
-        NoScaleError: no board was seen, too few images saw it, or it contradicts its file.
+        NoScaleError: no source of scale was seen, or too little of it, or a board contradicts its file, or nothing
+            tells the vertical.
     """
     stamps = list(poses)
-    places, placements, warnings = _sound_boards(evidence, poses, camera, config)
+    warnings: list[str] = []
+    measurements: list[Measurement] = []
+    places: list[PlacedBoard] = []
+    placements: list[BoardPlacement] = []
+    refusal: NoScaleError | None = None
+    try:
+        places, placements, warnings = _sound_boards(evidence, poses, camera, config)
+    except NoScaleError as error:
+        refusal = error
     inherited = [sensitivity(place, poses, camera, config) for place in places]
+    measurements += [board_measurement(*pair, stamps, config) for pair in zip(places, inherited, strict=True)]
     by_name = {place.board.name: (place, own) for place, own in reversed(list(zip(places, inherited, strict=True)))}
-    measurements: list[Measurement] = [
-        board_measurement(place, own, stamps, config) for place, own in zip(places, inherited, strict=True)
-    ]
     for distance in evidence.distances:
         measurement = distance_measurement(distance, by_name, stamps)
         if measurement is None:
             warnings.append(f"the distance {distance.name} tells nothing: its boards were not both measured")
         else:
             measurements.append(measurement)
+    path = None
+    if evidence.transforms:
+        try:
+            path = evidence.transforms.path(evidence.camera_frame, stamps)
+            measurements.append(odometry_measurement(path, poses, odometry))
+        except (NoPathError, OdometryError) as error:
+            warnings.append(str(error))
+    if refusal is not None and (not measurements or evidence.boards):
+        warnings.insert(0, str(refusal))
+    if not measurements:
+        assert refusal is not None
+        raise NoScaleError(refusal.reason, "; ".join(warnings))
     combined = combine(measurements, poses, covariance)
+    origin = places[0] if places else None
     verticals: list[Vertical] = []
-    origin = places[0]
-    if config.upright:
+    if evidence.accelerations:
+        try:
+            verticals.append(_gravity(evidence, poses, combined.scale))
+        except (NoPathError, GravityError) as error:
+            warnings.append(str(error))
+    if origin is not None and config.upright:
         origin, vertical, text = board_vertical(origin, poses)
         verticals.append(vertical)
         warnings += [text] if text else []
+    if path is not None and len(path.stamps):
+        verticals.append(path_vertical(path, poses))
+    if not verticals:
+        raise NoScaleError(
+            "no_vertical",
+            "nothing tells what is up: hang the board upright and set upright to true, or record an IMU or odometry",
+        )
     frame, description, disagreements = map_from_model(combined.scale, origin, verticals, poses)
     return ScaleEstimate(
         combined.scale,
@@ -93,12 +137,19 @@ def estimate_scale(
     )
 
 
+def _gravity(evidence: Evidence, poses: Mapping[int, FloatArray], scale: float) -> Vertical:
+    frames = {one.frame for one in evidence.accelerations}
+    turns = {frame: evidence.transforms.static_rotation(evidence.camera_frame, frame) for frame in frames}
+    forces = np.stack([turns[one.frame] @ one.force for one in evidence.accelerations])
+    return gravity(np.array([one.stamp for one in evidence.accelerations], np.int64), forces, poses, scale)
+
+
 def _sound_boards(
     evidence: Evidence, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig
 ) -> tuple[list[PlacedBoard], list[BoardPlacement], list[str]]:
     """Boards that agree with their file, what was measured of them, and why others were refused."""
     if not evidence.boards:
-        raise NoScaleError("no_board", "no board file was given: hang up a board and name its file, for metres")
+        raise NoScaleError("no_board", "nothing tells the scale: hang up a board and name its file, or record odometry")
     seen = sum(stamp in poses and len(found) > 0 for stamp, found in evidence.observations.items())
     if not seen:
         names = ", ".join(board.name for board in evidence.boards)

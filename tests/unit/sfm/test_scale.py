@@ -209,7 +209,7 @@ def test_a_board_that_contradicts_its_file_is_refused_with_the_residuals(offset)
 
 def test_reasons_for_no_scale():
     walk = Walk(8)
-    with pytest.raises(NoScaleError, match="no board file") as caught:
+    with pytest.raises(NoScaleError, match="nothing tells the scale") as caught:
         estimate_scale(Evidence(), walk.poses, CAMERA, CONFIG)
     with pytest.raises(NoScaleError, match="B") as caught:
         walk.estimate((LOPSIDED,))
@@ -278,7 +278,7 @@ class DriftingWalk:
     def score(self, covariance):
         """Error of the scale over its standard deviation."""
         config = replace(CONFIG, tolerance=0.0)
-        estimate = estimate_scale(self.evidence, self.poses, CAMERA, config, covariance)
+        estimate = estimate_scale(self.evidence, self.poses, CAMERA, config, covariance=covariance)
         return np.log(estimate.scale / self.true_scale) / estimate.sigma
 
 
