@@ -1,0 +1,259 @@
+"""The selector's node between a camera and an SfM that answers as it is told, all in this process."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
+from pipeprog_frames.node import FramesNode
+from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
+from pipeprog_msgs.srv import Finish
+from pipeprog_node import messages, qos
+
+CAMERA = Camera(640, 360, 450.0, 450.0, 319.5, 179.5)
+START = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def wall() -> NDArray[np.uint8]:
+    noise = np.random.default_rng(0).standard_normal((400, 6400)).astype(np.float32)
+    smooth = sum(sigma * cv2.GaussianBlur(noise, (0, 0), sigma) for sigma in (3.0, 10.0, 30.0))
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def view(wall: NDArray[np.uint8], x: int) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(wall[20:380, x : x + 640])
+
+
+class Stage:
+    """The node under test, the camera's topics, and what the SfM hears and answers."""
+
+    def __init__(self, arguments: list[str], image_type: type, image: str, camera_info: str) -> None:
+        rclpy.init(args=["--ros-args", "--log-level", "error", *arguments])
+        self.node = FramesNode()
+        self.others = Node("others")
+        self.keyframes: list[CompressedImage] = []
+        self.decisions: list[FrameDecision] = []
+        self.retired: list[KeyframesRetired] = []
+        self.health: list[DiagnosticStatus] = []
+        listen = self.others.create_subscription
+        listen(CompressedImage, "keyframes/image/compressed", self.keyframes.append, qos.reliable(50))
+        listen(FrameDecision, "frame_decisions", self.decisions.append, qos.reliable(1000))
+        listen(KeyframesRetired, "keyframes/retired", self.retired.append, qos.reliable(50))
+        listen(DiagnosticArray, "/diagnostics", lambda message: self.health.extend(message.status), 10)
+        self._images = self.others.create_publisher(image_type, image, qos.reliable(50))
+        self._infos = self.others.create_publisher(CameraInfo, camera_info, qos.reliable(50))
+        self._overlaps = self.others.create_publisher(ImageOverlapArray, "image_overlap", qos.kept(50))
+        self._executor = SingleThreadedExecutor()
+        for node in (self.node, self.others):
+            self._executor.add_node(node)
+        self.spin_until(
+            lambda: (
+                min(topic.get_subscription_count() for topic in (self._images, self._infos, self._overlaps)) > 0
+                and self.others.count_publishers("keyframes/image/compressed") > 0
+            )
+        )
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        for node in (self.node, self.others):
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+    def spin_until(self, condition: Callable[[], object], seconds: float = 20.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, "waited in vain"
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def show(self, stamp: int, image: Image | CompressedImage) -> None:
+        """One image with its calibration, and all that follows from it."""
+        considered = len(self.decisions)
+        self._infos.publish(messages.info_from_camera(CAMERA, stamp, image.header.frame_id))
+        self._images.publish(image)
+        deadline = time.monotonic() + 0.3
+        while len(self.decisions) == considered and time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def publish_answer(self, message: ImageOverlapArray) -> None:
+        self._overlaps.publish(message)
+
+    def answer(self, stamp: int, count: int, images: list[ImageOverlap]) -> None:
+        header = messages.header(stamp, "camera")
+        self.publish_answer(ImageOverlapArray(header=header, keyframes_considered=count, images=images))
+
+    def chosen(self) -> list[int]:
+        return [messages.stamp_ns(message.header.stamp) for message in self.keyframes]
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Stage]]:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.SystemRandom().randrange(101, 200)))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    stages = []
+
+    def make(
+        *arguments: str,
+        image_type: type = CompressedImage,
+        image: str = "image/compressed",
+        camera_info: str = "camera_info",
+    ) -> Stage:
+        stages.append(Stage(list(arguments), image_type, image, camera_info))
+        return stages[-1]
+
+    yield make
+    for each in stages:
+        each.close()
+
+
+def compressed(stamp: int, image: NDArray[np.uint8], kind: str = "jpeg", frame: str = "camera") -> CompressedImage:
+    message = messages.compressed_image(stamp, frame, cv2.imencode(".jpg", image)[1].tobytes())
+    message.format = kind
+    return message
+
+
+def tie(stamp: int, overlap: float, before: int, after: int) -> ImageOverlap:
+    return ImageOverlap(
+        stamp=messages.time_msg(stamp),
+        registered=True,
+        overlap=overlap,
+        cell_overlap=overlap,
+        matches_previous=before,
+        matches_next=after,
+    )
+
+
+def test_one_of_several_grey_cameras_with_irregular_stamps(stage: Callable[..., Stage], wall: NDArray) -> None:
+    """As a Spot gives them: five raw grey cameras, each with its topics, at 2 to 15 Hz."""
+    names = {"image": "/camera/frontleft/image", "camera_info": "/camera/frontleft/camera_info"}
+    remap = [word for name, topic in names.items() for word in ("-r", f"{name}:={topic}")]
+    scene = stage("-p", "image_transport:=raw", *remap, image_type=Image, **names)
+    other = scene.others.create_publisher(Image, "/camera/frontright/image", qos.reliable(10))
+    stamp, shown = START, []
+    for index, gap in enumerate(np.random.default_rng(1).uniform(1 / 15, 1 / 2, 24)):
+        stamp += int(gap * 1e9)
+        pixels = view(wall, 30 * index)
+        for frame, publish in (("frontright", other.publish), ("frontleft", None)):
+            message = Image(header=messages.header(stamp, frame), height=360, width=640, encoding="mono8", step=640)
+            message.data = pixels.tobytes()
+            scene.show(stamp, message) if publish is None else publish(message)
+        shown.append(stamp)
+    assert {message.header.frame_id for message in scene.keyframes} == {"frontleft"}
+    chosen = scene.chosen()
+    assert set(chosen) <= set(shown)
+    places = [30 * shown.index(stamp) for stamp in chosen]
+    assert len(chosen) >= 6
+    assert np.diff(places).max() <= 0.15 * 640
+
+
+@pytest.mark.parametrize("kind", ["", "JPG", "mono8; jpeg compressed ", "rgb8; jpeg compressed bgr8", "png"])
+def test_whatever_the_format_says(stage: Callable[..., Stage], wall: NDArray, kind: str) -> None:
+    scene = stage()
+    for index in range(8):
+        stamp = START + index * 200_000_000
+        scene.show(stamp, compressed(stamp, view(wall, 80 * index), kind))
+    scene.spin_until(lambda: len(scene.keyframes) >= 6)
+
+
+def test_live_a_lagging_sfm_gets_fewer_keyframes_and_people_are_told(
+    stage: Callable[..., Stage], wall: NDArray
+) -> None:
+    scene = stage()
+    for index in range(100):
+        stamp = START + index * 200_000_000
+        scene.show(stamp, compressed(stamp, view(wall, 50 * index)))
+        if scene.keyframes and index < 40:  # the SfM works off the first keyframe and no more
+            first = scene.chosen()[0]
+            scene.answer(first, 1, [tie(first, 1.0, 0, 0)])
+    chosen = [(stamp - START) // 200_000_000 for stamp in scene.chosen()]
+    early = sum(index < 20 for index in chosen)
+    late = sum(20 <= index < 40 for index in chosen)
+    assert late < early
+    scene.health.clear()
+    scene.spin_until(lambda: any("cannot keep up" in status.message for status in scene.health))
+
+
+def test_what_the_sfm_answers_adds_and_retires_keyframes(stage: Callable[..., Stage], wall: NDArray) -> None:
+    scene = stage()
+    for index in range(40):
+        stamp = START + index * 33_000_000
+        scene.show(stamp, compressed(stamp, view(wall, 20 * index)))
+    chosen = scene.chosen()
+    assert len(chosen) >= 5
+    ties = [tie(stamp, 0.95, 500, 500) for stamp in chosen]
+    ties[2] = tie(chosen[2], 0.5, 500, 100)
+    scene.answer(chosen[-1], len(chosen), ties)
+    scene.spin_until(lambda: len(scene.keyframes) > len(chosen))
+    added = scene.chosen()[-1]
+    assert chosen[2] < added < chosen[3]
+    scene.spin_until(lambda: any("0.50 < 0.85" in decision.reason for decision in scene.decisions))
+    assert not scene.retired, "the selector has left none out that the overlap does not ask for"
+
+
+def test_a_recording_becomes_a_network(stage: Callable[..., Stage], wall: NDArray) -> None:
+    """0.5 frames a second, of which the SfM's answers leave every second one, until no group is above the band."""
+    scene = stage("-p", "policy:=network", "-p", "lockstep:=true")
+    scene.others.create_subscription(CameraInfo, "keyframes/camera_info", lambda _: None, qos.reliable(50))
+    scene.others.create_subscription(CameraInfo, "keyframes/camera_info", lambda _: None, qos.reliable(50))
+    images: set[int] = set()
+    done = [0, 0]
+
+    def answer() -> None:
+        ties = [tie(stamp, 0.99 if len(images) > 4 else 0.86, 500, 500) for stamp in sorted(images)]
+        scene.publish_answer(
+            ImageOverlapArray(
+                header=messages.header(max(images), "camera"),
+                keyframes_considered=done[0],
+                retirements_considered=done[1],
+                images=ties,
+            )
+        )
+
+    def on_keyframe(message: CompressedImage) -> None:
+        images.add(messages.stamp_ns(message.header.stamp))
+        done[0] += 1
+        answer()
+
+    def on_retired(message: KeyframesRetired) -> None:
+        assert message.keyframes_published == done[0]
+        images.difference_update(messages.stamp_ns(stamp) for stamp in message.stamps)
+        done[1] += 1
+        answer()
+
+    scene.others.create_subscription(CompressedImage, "keyframes/image/compressed", on_keyframe, qos.reliable(50))
+    scene.others.create_subscription(KeyframesRetired, "keyframes/retired", on_retired, qos.reliable(50))
+    stamps = [START + index * 500_000_000 for index in range(40)]
+    for index, stamp in enumerate(stamps):
+        scene.show(stamp, compressed(stamp, view(wall, 20 * index)))
+    finish = scene.others.create_client(Finish, "frames/finish")
+    scene.spin_until(finish.service_is_ready)
+    end = finish.call_async(Finish.Request(expected_inputs=len(stamps)))
+    scene.spin_until(end.done)
+    assert end.result().success
+    assert end.result().outputs == done[0] == 10
+    assert sorted(images) == [stamps[index] for index in (0, 16, 32, 36)]
+
+    def last_word() -> set[int]:
+        latest = {messages.stamp_ns(decision.header.stamp): decision.chosen for decision in scene.decisions}
+        return {stamp for stamp, chosen in latest.items() if chosen}
+
+    scene.spin_until(lambda: last_word() == images)
+
+
+def test_a_network_takes_a_recording(stage: Callable[..., Stage]) -> None:
+    with pytest.raises(InputError, match="pipeprog replay"):
+        stage("-p", "policy:=network")
+    rclpy.try_shutdown()
