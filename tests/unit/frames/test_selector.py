@@ -1,3 +1,4 @@
+import tracemalloc
 from collections.abc import Sequence
 from functools import partial
 
@@ -8,8 +9,10 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import is_cut_off, reduction
+from pipeprog_frames.decoding import decode_reduced, is_cut_off, reduction
+from pipeprog_frames.ring import Frame, FrameFile, FrameRing
 from pipeprog_frames.selector import Decision, FrameSelector, Load
+from pipeprog_frames.stream import Stream
 from pipeprog_frames.tracker import Tracker
 
 WIDTH, HEIGHT = 320, 180
@@ -159,3 +162,76 @@ def test_a_jpeg_without_its_end_is_damaged(wall: NDArray[np.uint8]) -> None:
     assert not is_cut_off(cv2.imencode(".png", pan(wall, 0))[1].tobytes())
     assert is_cut_off(whole[: len(whole) // 2])
     assert is_cut_off(b"")
+
+
+def test_a_long_4k_stream_stays_in_flat_memory(wall: NDArray[np.uint8]) -> None:
+    """Ten minutes at 30 Hz, shortened to what fills the ring three times over: 1 MiB a frame."""
+    camera = Camera(3840, 2160, 2700.0, 2700.0, 1919.5, 1079.5)
+    capacity = 64 << 20
+    ring = FrameRing(capacity)
+    stream = Stream(FramesConfig(), camera, ring.middle)
+    views = [cv2.resize(pan(wall, 2.5 * index), (480, 270)) for index in range(60)]
+    peaks = []
+    tracemalloc.start()
+    for index in range(240):
+        stamp = 1 + index * 33_333_333
+        ring.add(Frame(stamp, "camera", bytes(1 << 20), camera))
+        # There and back: a stream that would walk on would need a wall of ten minutes.
+        stream.consider(stamp, partial(views.__getitem__, min(index % 120, 119 - index % 120)))
+        if index % 60 == 59:
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.reset_peak()
+    tracemalloc.stop()
+    assert max(peaks[1:]) < capacity + (8 << 20)
+    assert max(peaks[2:]) - min(peaks[2:]) < 1 << 20
+
+
+def test_the_ring_gives_up_its_oldest_and_the_file_none(wall: NDArray[np.uint8]) -> None:
+    encoded = [cv2.imencode(".jpg", pan(wall, 3 * index))[1].tobytes() for index in range(20)]
+    camera = Camera(WIDTH, HEIGHT, 225.0, 225.0, 159.5, 89.5)
+    ring, file = FrameRing(sum(map(len, encoded[10:]))), FrameFile()
+    for store in (ring, file):
+        for index, data in enumerate(encoded):
+            store.add(Frame(index + 1, "camera", data, camera))
+        store.add(Frame(1, "camera", b"again", camera))  # a stamp that runs backwards
+        kept = store.get(20)
+        assert kept is not None
+        assert kept.encoded == encoded[19]
+        assert store.middle(12, 20) in (15, 16, 17)
+        assert store.middle(15, 17, {16}) is None
+    assert ring.get(5) is None
+    first = file.get(1)
+    assert first is not None
+    assert first.encoded == encoded[0]
+    assert file.middle(1, 9) in (4, 5, 6)
+    assert ring.middle(1, 9) is None
+
+
+def test_the_sharpest_about_the_middle_is_taken_and_a_useless_frame_never(wall: NDArray[np.uint8]) -> None:
+    ring = FrameRing(1 << 30)
+    camera = Camera(WIDTH, HEIGHT, 225.0, 225.0, 159.5, 89.5)
+    images = [pan(wall, 3 * index) for index in range(9)]
+    images[3], images[4] = cv2.GaussianBlur(images[3], (0, 0), 3), np.full((HEIGHT, WIDTH), 3, np.uint8)
+    for index, image in enumerate(images):
+        ring.add(Frame(index, "camera", cv2.imencode(".jpg", image)[1].tobytes(), camera))
+    assert ring.middle(0, 8) in (2, 5)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_a_camera_that_is_mounted_turned_chooses_the_same(wall: NDArray[np.uint8], turns: int) -> None:
+    """Spot's front cameras lie on their sides; grey PNG at irregular 2 to 15 Hz."""
+    stamps = 1 + np.cumsum(np.random.default_rng(3).uniform(1 / 15, 1 / 2, 40) * 1e9).astype(int)
+    width, height = (WIDTH, HEIGHT) if turns % 2 == 0 else (HEIGHT, WIDTH)
+    camera = Camera(2 * width, 2 * height, 450.0, 450.0, width - 0.5, height - 0.5)
+    chosen = []
+    selector = FrameSelector(FramesConfig(), camera)
+    decisions = []
+    for index, stamp in enumerate(stamps):
+        image = np.rot90(cv2.resize(pan(wall, 12 * index), (2 * WIDTH, 2 * HEIGHT)), turns)
+        encoded = cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes()
+        decisions += selector.consider(int(stamp), partial(decode_reduced, encoded, camera.width))
+    decisions = sorted(decisions + selector.flush(), key=lambda decision: decision.stamp)
+    chosen = [index for index, decision in enumerate(decisions) if decision.chosen]
+    assert len(decisions) == 40
+    assert np.diff(chosen).max() <= 4  # 12 px a frame: 0.15 of the width are four
+    assert 10 <= len(chosen) <= 16
