@@ -82,13 +82,20 @@ def detect(
     out: Out,
     force: Force = False,
     overrides: Set = None,
+    plane: Annotated[
+        str | None,
+        typer.Option(
+            "--plane", help="Only the pipes that a plane through three points cuts.", metavar="'X,Y,Z X,Y,Z X,Y,Z'"
+        ),
+    ] = None,
 ) -> None:
     """Find and classify the pipes of a metric point cloud."""
     from pipeprog_bringup.console import print_progress, share_bar
     from pipeprog_bringup.detecting import detect_file
 
+    cut = [] if plane is None else ["detect.front_end=planes", f"detect.plane={plane}"]
     with share_bar("detect") as report:
-        detection = detect_file(cloud, boq, out, overrides or [], force, report)
+        detection = detect_file(cloud, boq, out, [*cut, *(overrides or [])], force, report)
     if detection.dropped:
         _note(f"{detection.dropped} points of {cloud} are not finite and were left out")
     print_progress(detection.pipes, detection.classes)

@@ -24,7 +24,26 @@ class DetectConfig:
     )
     front_end: str = field(
         default="normals",
-        metadata={"description": "how cylinders are found in the cloud", "unit": "", "choices": ("normals", "planes")},
+        metadata={
+            "description": "how cylinders are found in the cloud: by its normals, or as sections of planes (the paper)",
+            "unit": "",
+            "choices": ("normals", "planes"),
+        },
+    )
+    plane: str = field(
+        default="",
+        metadata={
+            "description": "front_end=planes: three points `x,y,z x,y,z x,y,z` of the plane that cuts the pipes, "
+            "several planes parted by semicolons; without, planes are placed across the pipes",
+            "unit": "m",
+        },
+    )
+    straighten: bool = field(
+        default=False,
+        metadata={
+            "description": "front_end=planes: sections are taken along the pipe, which thin ones at a slant need",
+            "unit": "",
+        },
     )
     concave: bool = field(
         default=False,

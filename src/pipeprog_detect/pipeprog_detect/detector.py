@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_camera.errors import InputError
 from pipeprog_detect import background, classify, hypotheses, normals, octree
@@ -15,6 +16,7 @@ from pipeprog_detect.hypotheses import Hypothesis
 from pipeprog_detect.inside import find_concave
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
+from pipeprog_detect.planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
 from pipeprog_detect.refinement import Jury, Measured
 from pipeprog_detect.runs import elbows, join, near, spanning
 from pipeprog_detect.verify import Candidate, measure, outwardness, own_points, settle, thin_start
@@ -50,8 +52,6 @@ def detect(
     the share done (0..1) and what is being done.
     """
     report = progress or _silent
-    if config.front_end != "normals":
-        raise InputError(f"the front end '{config.front_end}' is not built yet: use front_end=normals")
     points = np.asarray(cloud.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"the cloud's points have the shape {points.shape}: give N x 3 metres")
@@ -80,7 +80,8 @@ def detect(
     # A cloud with normals towards cameras is stereo's, too.
     noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)
-    candidates = find_candidates(tree, outward, noise, radius_range, planned_radii, config, jury, report)
+    planes = [replace(plane, point=plane.point - shift) for plane in parse_planes(config.plane)] if config.plane else []
+    candidates = find_candidates(tree, outward, noise, radius_range, planned_radii, planes, config, jury, report)
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
     report(1.0, "done")
@@ -93,6 +94,7 @@ def find_candidates(
     sigma: float,
     radius_range: tuple[float, float],
     planned_radii: Sequence[float],
+    planes: Sequence[CuttingPlane],
     config: DetectConfig,
     jury: Jury,
     report: Report,
@@ -116,23 +118,14 @@ def find_candidates(
             cylinder = candidate.cylinder
             free[tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)] = False
 
-    scales = [scale for scale in _SCALES if scale < radius_range[1] and 2.0 * scale > radius_range[0]]
-    for number, scale in enumerate(scales):
-        report(0.2 + 0.5 * number / len(scales), f"looking for pipes in patches of {1e3 * scale:.0f} mm")
-        rest = tree.subset(free)
-        fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
-        shape = normals.surfaces(fine, rest.thinned(rest.level_of(scale)), scale, sigma)
-        for hypothesis in hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range)):
+    if config.front_end == "planes":
+        report(0.2, "looking for sections of pipes")
+        planes = planes or place_planes(tree, sigma, radius_range)
+        for hypothesis in section_hypotheses(tree, free, planes, sigma, radius_range, config.seed, config.straighten):
             consider(hypothesis)
-    report(0.7, "looking for thin pipes")
-    thin = [planned for planned in planned_radii if planned < _THICKEST_LINE] or [0.5 * _THICKEST_LINE]
-    rest = tree.subset(free)
-    fine = rest.thinned(rest.level_of(_LINE_SCALE / _POINTS_PER_SCALE))
-    shape = normals.surfaces(fine, rest.thinned(rest.level_of(0.5 * _LINE_SCALE)), _LINE_SCALE, sigma)
-    for line in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
-        initial = thin_start(tree, free, line.cylinder, 1.2 * sigma, thin)
-        if initial is not None:
-            consider(Hypothesis(initial, line.votes))
+    else:
+        for hypothesis in _voted(tree, free, sigma, radius_range, planned_radii, report):
+            consider(hypothesis)
     report(0.8, "measuring")
     # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate.
     return [
@@ -142,6 +135,33 @@ def find_candidates(
         or not candidate.blurred
         or any(abs(candidate.cylinder.radius - radius) < 4.0 * candidate.radius_sigma for radius in planned_radii)
     ]
+
+
+def _voted(
+    tree: Octree,
+    free: NDArray[np.bool_],
+    sigma: float,
+    radius_range: tuple[float, float],
+    planned_radii: Sequence[float],
+    report: Report,
+) -> Iterator[Hypothesis]:
+    """Hypotheses of the tree's points that are free at that time (N,): bent patches, fine to coarse, then lines."""
+    scales = [scale for scale in _SCALES if scale < radius_range[1] and 2.0 * scale > radius_range[0]]
+    for number, scale in enumerate(scales):
+        report(0.2 + 0.5 * number / len(scales), f"looking for pipes in patches of {1e3 * scale:.0f} mm")
+        rest = tree.subset(free)
+        fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
+        shape = normals.surfaces(fine, rest.thinned(rest.level_of(scale)), scale, sigma)
+        yield from hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range))
+    report(0.7, "looking for thin pipes")
+    thin = [planned for planned in planned_radii if planned < _THICKEST_LINE] or [0.5 * _THICKEST_LINE]
+    rest = tree.subset(free)
+    fine = rest.thinned(rest.level_of(_LINE_SCALE / _POINTS_PER_SCALE))
+    shape = normals.surfaces(fine, rest.thinned(rest.level_of(0.5 * _LINE_SCALE)), _LINE_SCALE, sigma)
+    for line in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
+        initial = thin_start(tree, free, line.cylinder, 1.2 * sigma, thin)
+        if initial is not None:
+            yield Hypothesis(initial, line.votes)
 
 
 def _settled(
