@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ ROBUST, FLOOR = 0.3, 0.1
 # A tenth of the blur remains as the limb model's own error, common to all views [px]; where the outline is not seen,
 # edges of texture take its place, spread evenly within the robust loss.
 MODEL_ERROR, CLUTTER_ERROR = 0.05, ROBUST / np.sqrt(3.0)
+# A planned radius is that of the pipe within so much, make and edges included.
+KNOWN_RADIUS = 0.08
 # Where the vote cannot tell, so many candidates compete on sub-pixel edges.
 CANDIDATES = 3
 # Edges count within so many pixels of the vote's and of the refined outlines.
@@ -49,7 +51,8 @@ class ContourFit:
     `covariance` (5, 5) of the axis' offset at its middle (2) [m], its direction (2) [rad] and the radius [m], the
     directions being those of `basis` (2, 3); `support` share of the outline with an edge in three views or more;
     `views` number of views used; `start_sigma`, `end_sigma` [m], NaN where the images do not show that end and the
-    given one stands.
+    given one stands. `flatness`, with its standard deviation `flatness_sigma`: 0 for a cylinder, whose outlines keep
+    their distance from the axis from all sides; 1 for a painted strip or a joint, whose edges stay where they are.
     """
 
     cylinder: Cylinder
@@ -60,6 +63,8 @@ class ContourFit:
     views: int
     start_sigma: float
     end_sigma: float
+    flatness: float
+    flatness_sigma: float
 
 
 def refine(
@@ -70,12 +75,14 @@ def refine(
     config: ContourConfig,
     planned_radii: Sequence[float] = (),
     follow: bool = True,
+    depth_sigma: float = 0.0,
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
     `initial_radius_sigma` [m] is the standard deviation of the given radius; that of the axis is taken as twice as
     much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the
-    pipe is made as long as its outlines are seen, and its ends are looked for.
+    pipe is made as long as its outlines are seen, and its ends are looked for. Where `depth_sigma` [m] is given, it is
+    the radius that is known, and the distance from the cameras only to so much.
 
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
@@ -84,11 +91,12 @@ def refine(
     if not config.enabled or not views:
         return None
     basis = frame(cylinder, viewing_direction(cylinder, views))
-    candidates = _vote(cylinder, initial_radius_sigma, views, others, basis, planned_radii)
+    candidates = _vote(cylinder, initial_radius_sigma, depth_sigma, views, others, basis, planned_radii)
     if not len(candidates):
         return None
     prior = np.zeros(5)
     prior[:4] = 1.0 / (2.0 * initial_radius_sigma) ** 2
+    prior[[1, 3]] = 1.0 / max(2.0 * initial_radius_sigma, depth_sigma) ** 2
     scene = (views, others, basis)
     still: FloatArray = np.zeros(len(views))
     blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, still, CHUNK)
@@ -114,7 +122,7 @@ def refine(
     if follow:
         offset = refined.solution.view_offset
         ends = [find_end(refined.cylinder, at_end, *scene, offset, blur) for at_end in (False, True)]
-    return _result(refined.cylinder, refined.solution, refined.share, basis, refined.at, ends)
+    return _result(refined, basis, views, ends)
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,7 @@ class _Refined:
     solution: _Solution
     share: float
     at: Stations
+    edges: LimbEdges
 
 
 def _fine(
@@ -147,7 +156,7 @@ def _fine(
         step = step + solution.step
         view_offset = solution.view_offset
     share = support_profile(at, hits(at, _moved_by(edges, at, solution), view_offset)).share
-    return _Refined(moved(cylinder, basis, step), solution, share, at)
+    return _Refined(moved(cylinder, basis, step), solution, share, at, edges)
 
 
 def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:
@@ -160,6 +169,7 @@ def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:
 def _vote(
     cylinder: Cylinder,
     sigma: float,
+    depth_sigma: float,
     views: Sequence[View],
     others: Sequence[Cylinder],
     basis: FloatArray,
@@ -175,7 +185,10 @@ def _vote(
     radius = cylinder.radius
     aside = float(np.clip(3.0 * sigma, 2.0 * pixel, 0.4 * radius))
     thicker = float(np.clip(2.5 * sigma, 2.0 * pixel, 0.3 * radius))
-    reach = np.array([aside, aside, aside, aside, thicker])
+    deep = aside
+    if depth_sigma > 0:
+        aside, deep, thicker = 0.8 * radius, 2.0 * depth_sigma, KNOWN_RADIUS * radius
+    reach = np.array([aside, deep, aside, deep, thicker])
     furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, (aside + thicker) * float(at.gain.max()))
     spacing = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))
     offsets = np.arange(-np.ceil(furthest / spacing) - 2, np.ceil(furthest / spacing) + 3) * spacing
@@ -220,6 +233,7 @@ class _Solution:
 def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far: FloatArray) -> _Solution:
     """Robust least squares for the step (5,) with a sideways offset of each view as a random effect.
 
+    There may be more unknowns: as many as the Jacobian has columns.
     A wrong pose moves both outlines of a view together, which says nothing about the radius: the offsets' variance is
     estimated from the views' scatter (expectation maximisation), so that with true poses they vanish. `prior` (5,) is
     the precision [1/m^2] of the start, from which `so_far` (5,) has led: where the views lie in a row along the pipe,
@@ -230,7 +244,8 @@ def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far
     """
     jacobian = at.jacobian
     sign = sideways(at)
-    step = np.zeros(5)
+    unknowns = jacobian.shape[1]
+    step: FloatArray = np.zeros(unknowns)
     offset = np.zeros(count)
     variance = 0.25
     rows = np.arange(len(at))
@@ -245,10 +260,10 @@ def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far
         weight = used / (sigma**2 + FLOOR**2) / (1.0 + (residual / ROBUST) ** 2)
         weighted = jacobian * weight[:, None]
         own = np.bincount(at.view, weight, count) + 1.0 / variance
-        cross = np.stack([np.bincount(at.view, sign * weighted[:, k], count) for k in range(5)], axis=1)
+        cross = np.stack([np.bincount(at.view, sign * weighted[:, k], count) for k in range(unknowns)], axis=1)
         right = np.bincount(at.view, sign * weight * seen, count)
         normal = weighted.T @ jacobian - (cross / own[:, None]).T @ cross + np.diag(prior)
-        normal += np.diag(np.full(5, 1e-9 * np.trace(normal)))
+        normal += np.diag(np.full(unknowns, 1e-9 * np.trace(normal)))
         step = np.linalg.solve(normal, weighted.T @ seen - cross.T @ (right / own) - prior * so_far)
         offset = (right - cross @ step) / own
         active = own > 2.0 / variance
@@ -262,6 +277,28 @@ def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far
     return _Solution(step, inverse @ spread @ inverse + inverse, offset, used)
 
 
+def _flatness(refined: _Refined, views: Sequence[View]) -> tuple[float, float]:
+    """Share of a strip's displacement that is in the edges, beside a step of the cylinder, and its sigma."""
+    strip = _as_strip(refined.at, refined.cylinder, views)
+    widened = replace(refined.at, jacobian=np.column_stack([refined.at.jacobian, strip]))
+    solution = _solve(widened, refined.edges, len(views), np.zeros(6), np.zeros(6))
+    return float(solution.step[5]), float(np.sqrt(solution.covariance[5, 5]))
+
+
+def _as_strip(at: Stations, cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
+    """Outward displacement (N,) [px] of the outlines if a flat strip that faces the mean view were in their place.
+
+    Seen from an angle off its normal a strip of half-width R looks R cos(angle) wide, a cylinder as wide as before.
+    """
+    middle = 0.5 * (cylinder.start + cylinder.end)
+    towards = np.stack([camera_centre(view) - middle for view in views])
+    towards = towards - np.outer(towards @ cylinder.axis, cylinder.axis)
+    towards = towards / (np.linalg.norm(towards, axis=1)[:, None] + 1e-12)
+    facing = towards[np.unique(at.view)].sum(axis=0)
+    facing = facing / (np.linalg.norm(facing) + 1e-12)
+    return np.asarray(at.half_width * (towards @ facing - 1.0)[at.view], np.float64)
+
+
 def _places(at: Stations) -> NDArray[np.int64]:
     """Index (N,) of each station's position along the axis: texture there is the same in all views."""
     return np.unique(np.round(at.along, 6), return_inverse=True)[1].astype(np.int64)
@@ -269,7 +306,7 @@ def _places(at: Stations) -> NDArray[np.int64]:
 
 def _clustered(scores: FloatArray, group: NDArray[np.int64], used: NDArray[np.bool_]) -> FloatArray:
     """Sum (5, 5) of the outer products of the scores (N, 5) of each group, corrected for few groups."""
-    total = np.stack([np.bincount(group, scores[:, k]) for k in range(5)], axis=1)
+    total = np.stack([np.bincount(group, column) for column in scores.T], axis=1)
     groups = len(np.unique(group[used]))
     return total.T @ total * groups / max(groups - 3, 1)
 
@@ -279,14 +316,8 @@ def _moved_by(edges: LimbEdges, at: Stations, solution: _Solution) -> LimbEdges:
     return LimbEdges(edges.offset - (at.jacobian @ solution.step)[:, None], edges.sigma, edges.explained)
 
 
-def _result(
-    cylinder: Cylinder,
-    solution: _Solution,
-    share: float,
-    basis: FloatArray,
-    at: Stations,
-    ends: Sequence[End | None],
-) -> ContourFit:
+def _result(refined: _Refined, basis: FloatArray, views: Sequence[View], ends: Sequence[End | None]) -> ContourFit:
+    cylinder, solution, share, at = refined.cylinder, refined.solution, refined.share, refined.at
     length, axis = cylinder.length, cylinder.axis
     from_ends = np.zeros((5, 5))
     from_ends[0:2, 0:2] = from_ends[0:2, 2:4] = 0.5 * np.eye(2)
@@ -310,4 +341,5 @@ def _result(
         len(np.unique(at.view[solution.used])),
         start.sigma if start else float("nan"),
         end.sigma if end else float("nan"),
+        *_flatness(refined, views),
     )

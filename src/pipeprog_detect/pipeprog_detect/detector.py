@@ -84,6 +84,8 @@ def detect(
     candidates = find_candidates(tree, outward, noise, radius_range, planned_radii, planes, config, jury, report)
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
+    report(0.95, "looking for thin pipes in the keyframes")
+    measured += jury.measure_lost(points[finite] - shift, _THICKEST_LINE, measured)
     report(1.0, "done")
     return _product(measured, bill, shift, config)
 

@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.classify import classify
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import ContourFit, refine
+from pipeprog_detect.extent import Run
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.verify import Candidate
+from pipeprog_detect.ribbons import propose
+from pipeprog_detect.verify import Candidate, Evidence
 
 # Outlines of real pipes are supported along more than half of what is seen of them.
 CONVINCING = 0.5
@@ -20,6 +23,14 @@ CONVINCING = 0.5
 SETTLED, MAX_ROUNDS = 0.1, 3
 # Views that suffice to tell a pipe from a shadow; to measure it all are used.
 FEW_VIEWS = 30
+# Lines are followed up for so many pipes at most, beside so many of the cloud's points.
+MOST_LOST, MOST_POINTS = 40, 600_000
+# What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
+LINE_DEPTH_SIGMA = 0.03
+# Shorter than so many radii a pair of lines may be a hanger, a clamp, or chance.
+SLENDER = 20.0
+# A strip's edges stay where they are, a cylinder's outlines do not: halfway between, by so many standard deviations.
+FLAT, SURELY = 0.5, 2.0
 # The cloud resolves a section of five times its noise, seen along a third of the way around.
 RESOLVED_RADII, RESOLVED_ARC = 5.0, np.radians(120.0)
 
@@ -90,6 +101,35 @@ class Jury:
                 found.append(measured)
         return found
 
+    def measure_lost(
+        self, points: NDArray[np.floating], thickest: float, found: Sequence[Measured]
+    ) -> tuple[Measured, ...]:
+        """Pipes up to `thickest` [m] of which the keyframes show lines and the cloud (N, 3) too little.
+
+        They must have a planned size and most of their outlines, and these must move against each other from view to
+        view as a cylinder's do, where the views differ enough to tell.
+        """
+        thin = [planned.outer_radius for planned in self._bill.classes if planned.outer_radius < thickest]
+        if not self.sits or not thin:
+            return ()
+        some = points[:: -(-len(points) // MOST_POINTS)].astype(np.float32)
+        known = [measured.cylinder for measured in found]
+        lost: list[Measured] = []
+        for proposed in propose(self._views, some, thin, known, MOST_LOST):
+            if _is_known(proposed, known):
+                continue
+            sigma = proposed.radius
+            fit = refine(proposed, sigma, self._views, known, self._config, thin, depth_sigma=LINE_DEPTH_SIGMA)
+            if fit is None or fit.support < CONVINCING or not self._is_planned(fit) or _is_known(fit.cylinder, known):
+                continue
+            if fit.cylinder.length < SLENDER * fit.cylinder.radius:
+                continue
+            if fit.flatness - FLAT > SURELY * fit.flatness_sigma:
+                continue
+            lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma))
+            known.append(fit.cylinder)
+        return tuple(lost)
+
     def _is_planned(self, fit: ContourFit) -> bool:
         return classify(fit.cylinder.radius, fit.radius_sigma, self._bill).probability > 0.0
 
@@ -116,6 +156,25 @@ class Jury:
             if fit is not None:
                 fits.append(fit)
         return max(fits, key=lambda fit: fit.support, default=None)
+
+
+def _is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
+    """Whether the middle of the cylinder lies within a known one."""
+    return any(_contains(other, 0.5 * (cylinder.start + cylinder.end)) for other in known)
+
+
+def _seen(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:
+    """The candidate that stands for a pipe found by its lines, with what the cloud (N, 3) holds of it."""
+    cylinder = fit.cylinder
+    offset = points - cylinder.start
+    along = offset @ cylinder.axis
+    near = (along > 0) & (along < cylinder.length)
+    offset, along = offset[near], along[near]
+    distance = np.linalg.norm(offset - along[:, None] * cylinder.axis, axis=1) - cylinder.radius
+    distance = distance[np.abs(distance) < cylinder.radius]
+    noise = float(np.sqrt(np.mean(distance**2))) if len(distance) else cylinder.radius
+    evidence = Evidence(np.pi, fit.support, 0.0, noise, 0.0, 1.0)
+    return Candidate(cylinder, fit.radius_sigma, len(distance), [Run(0.0, cylinder.length)], evidence)
 
 
 def _contains(cylinder: Cylinder, point: FloatArray) -> bool:

@@ -1,0 +1,84 @@
+"""Thin pipes by lines in the images: edges, ribbons, and what tells a pipe from a painted strip."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeprog_detect.config import ContourConfig
+from pipeprog_detect.contour import refine
+from pipeprog_detect.lines import ribbons, straight_edges
+from pipeprog_detect.pipe import Cylinder, FloatArray, View
+from pipeprog_detect.ribbons import propose
+
+# The pipe and the wall of `pipe_views`; the shadow on the wall is as wide as a pipe of this radius.
+PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
+WALL, SHADOW, SHADOW_RADIUS = 0.12, 0.055, 0.04
+RADII = [PIPE.radius]
+
+
+def wall_points() -> FloatArray:
+    x, z = np.meshgrid(np.arange(-0.8, 0.8, 0.005), np.arange(-0.5, 0.5, 0.005))
+    return np.stack([x.ravel(), np.full(x.size, WALL), z.ravel()], axis=1)
+
+
+def front_points(cylinder: Cylinder) -> FloatArray:
+    """The half of the barrel that faces -y."""
+    angle, along = np.meshgrid(np.linspace(-1.3, 1.3, 30), np.arange(0.0, cylinder.length, 0.004))
+    side = np.cross(cylinder.axis, [0.0, -1.0, 0.0])
+    radial = np.cos(angle)[..., None] * np.array([0.0, -1.0, 0.0]) + np.sin(angle)[..., None] * side
+    return (cylinder.start + along[..., None] * cylinder.axis + cylinder.radius * radial).reshape(-1, 3)
+
+
+def cloud(*pipes: Cylinder) -> np.ndarray:
+    return np.concatenate([wall_points(), *(front_points(pipe) for pipe in pipes)]).astype(np.float32)
+
+
+def test_edges_of_a_band_make_one_ribbon() -> None:
+    image = np.full((200, 300), 90, np.uint8)
+    image[:, 140:152] = 180
+    edges = straight_edges(image)
+    assert len(edges) == 2
+    found = ribbons(edges, 5.0, 20.0)
+    assert len(found) == 1
+    assert found.width == pytest.approx(12.0, abs=0.5)
+    assert found.ends[..., 0] == pytest.approx(145.5, abs=0.5)
+    assert len(ribbons(edges, 15.0, 20.0)) == 0
+
+
+def test_pieces_of_one_edge_are_joined_and_a_blank_image_has_none() -> None:
+    image = np.full((200, 300), 90, np.uint8)
+    image[20:90, 140:] = 180
+    image[110:180, 140:] = 180
+    vertical = [edge for edge in straight_edges(image) if abs(edge[1, 0] - edge[0, 0]) < 2.0]
+    assert max(abs(edge[1, 1] - edge[0, 1]) for edge in vertical) > 150.0
+    assert len(straight_edges(np.full((50, 50), 7, np.uint8))) == 0
+
+
+def test_a_pipe_is_proposed_where_its_outlines_agree(pipe_views: list[View]) -> None:
+    found = propose(pipe_views, cloud(PIPE), RADII, [], 5)
+    assert found
+    offset = 0.5 * (found[0].start + found[0].end) - PIPE.start
+    assert np.linalg.norm(np.cross(offset, PIPE.axis)) < PIPE.radius
+    assert abs(found[0].axis @ PIPE.axis) > np.cos(np.radians(5.0))
+
+
+def test_known_pipes_and_strips_on_the_wall_are_not_proposed(pipe_views: list[View], empty_views: list[View]) -> None:
+    wide = Cylinder(PIPE.start - 0.1 * PIPE.axis, PIPE.end + 0.1 * PIPE.axis, 1.5 * PIPE.radius)
+    for cylinder in propose(pipe_views, cloud(PIPE), RADII, [wide], 5):
+        offset = 0.5 * (cylinder.start + cylinder.end) - PIPE.start
+        assert np.linalg.norm(np.cross(offset, PIPE.axis)) > PIPE.radius
+    assert propose(empty_views, cloud(), [SHADOW_RADIUS], [], 5) == []
+    assert propose([], cloud(), RADII, [], 5) == []
+
+
+def test_outlines_of_a_strip_stay_where_they_are(pipe_views: list[View]) -> None:
+    pipe = refine(PIPE, 0.004, pipe_views, [], ContourConfig())
+    assert pipe is not None
+    assert abs(pipe.flatness) < 0.3
+    assert pipe.flatness_sigma < 0.3
+    # The shadow is seen beside the pipe in the lower half of the walk's images, too.
+    at = np.array([SHADOW + SHADOW_RADIUS, WALL, 0.0])
+    up = np.array([0.0, 0.0, 0.2])
+    strip = refine(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002, pipe_views, [PIPE], ContourConfig())
+    assert strip is None or strip.flatness - 0.5 > -strip.flatness_sigma
