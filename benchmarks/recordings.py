@@ -39,6 +39,16 @@ def site(layout: str, seed: int, *options: str, folder: Path = FOLDER) -> Record
     return Recording(bag, " ".join(command))
 
 
+def named(text: str) -> Recording:
+    """What the command lines call `demo`, `lab:SEED[:OPTION...]`, `field:SEED[:OPTION...]`, or the path of a bag."""
+    kind, *rest = text.split(":")
+    if kind == "demo":
+        return DEMO
+    if kind in ("lab", "field"):
+        return site(kind, int(rest[0]), *(f"--{option}" for option in rest[1:]))
+    return Recording(Path(text).resolve(), "")
+
+
 def made(recording: Recording) -> Recording:
     """The recording, made now if it is not there; the generator shows its progress."""
     if not recording.bag.exists():

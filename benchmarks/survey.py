@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.recordings import DEMO, ROOT, Recording, made, site
+from benchmarks.recordings import ROOT, Recording, made, named
 from pipeprog_bringup.score import score_files
 
 RESULTS = Path(__file__).parent / "results"
@@ -84,15 +84,6 @@ def _commit() -> str:
     return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def _recording(text: str) -> Recording:
-    kind, *rest = text.split(":")
-    if kind == "demo":
-        return DEMO
-    if kind in ("lab", "field"):
-        return site(kind, int(rest[0]), *(f"--{option}" for option in rest[1:]))
-    return Recording(Path(text).resolve(), "")
-
-
 def line(name: str, figures: dict[str, Any]) -> str:
     """One line of a table: what was found, the errors, the time."""
     score = figures["score"]
@@ -118,7 +109,7 @@ def main() -> None:
     parser.add_argument("--name", default="", help="of the result, where settings make it differ from the plain one")
     arguments = parser.parse_args()
     for text in arguments.recordings:
-        recording = _recording(text)
+        recording = named(text)
         print(
             line(arguments.name or recording.name, survey(recording, arguments.overrides, arguments.name)), flush=True
         )

@@ -86,8 +86,13 @@ def score_files(pipes_json: Path, truth_json: Path) -> dict[str, Any]:
     trajectory_file = pipes_json.parent / "trajectory.tum"
     trajectory = None
     if trajectory_file.exists() and len(truth.world_from_camera):
-        trajectory = align(*_pairs(trajectory_file, truth_json, truth))
+        trajectory = aligned(trajectory_file, truth_json)
     return score(result, truth, trajectory)
+
+
+def aligned(trajectory_file: Path, truth_json: Path) -> Trajectory:
+    """How a trajectory.tum, with the frames.csv beside it, lies on the truth's poses; raises InputError."""
+    return align(*_pairs(trajectory_file, truth_json, read_truth(truth_json)))
 
 
 def score(result: Result, truth: Truth, trajectory: Trajectory | None = None) -> dict[str, Any]:
