@@ -10,6 +10,7 @@ from pipeprog_frames.selector import Decision
 
 MIN_GAIN = 0.01  # of overlap that an added frame must bring, or the next one would not help either
 MAX_BRIDGES = 3  # frames on each side of an image that does not register: the last comes within an eighth of the gap
+LOOKAHEAD = 2  # later keyframes that a judgement waits for
 MIN_RUN = 4  # "groups of more than three"
 
 Middle = Callable[[int, int, Collection[int]], "int | None"]  # the best frame between two stamps, without some
@@ -41,7 +42,8 @@ class _Keyframe:
 class StreamFeedback:
     """Keyframes so far, and what to change about them.
 
-    A keyframe is judged once the SfM has answered to its successor: before, half of what it shows is tied to nothing.
+    A keyframe is judged once the SfM has answered to the next two as well: the first of them ties the other half of
+    what it shows, the second one makes points of it.
     It counts as loose when the lower of hull and cell overlap (Eq. 1 of the paper, and its version that a single stray
     feature cannot move) is below `overlap_min`. Of runs of more than three above `overlap_max` every second one is
     given back where its neighbours still overlap by `overlap_min` and see each other within `parallax_max` px.
@@ -86,11 +88,11 @@ class StreamFeedback:
         return before, after
 
     def _is_judged(self, stamp: int, complete: bool) -> bool:
-        """Whether the SfM has answered to this keyframe and to both its neighbours."""
-        before, after = self._neighbours(stamp)
-        around = [other for other in (before, stamp, after) if other is not None]
-        if after is None and not complete:
+        """Whether the SfM has answered to this keyframe, the one before it and enough of those after it."""
+        index = bisect_left(self._stamps, stamp)
+        if index + LOOKAHEAD >= len(self._stamps) and not complete:
             return False
+        around = self._stamps[max(index - 1, 0) : index + LOOKAHEAD + 1]
         return all(self._keyframes[other].tie is not None for other in around)
 
     def _tighten(self, stamp: int) -> list[Decision]:
