@@ -33,7 +33,7 @@ $(VENV)/.packages: $(VENV)/.home requirements.txt requirements-ros.txt requireme
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-ros.txt -r requirements-dev.txt
 	@touch $@
 
-$(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(INTERFACES) $(PACKAGES)
+$(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(wildcard setup/tf2_msgs/* setup/tf2_msgs/msg/*) $(INTERFACES) $(PACKAGES)
 	@$(SHELL) setup/build.sh $(VENV)
 	@touch $@
 

@@ -11,7 +11,7 @@ echo 'import pipeprog_start' >"$packages/pipeprog_start.pth"
 echo "Building the workspace ..."
 export PATH="$venv/bin:$PATH" CMAKE_PREFIX_PATH="$venv" AMENT_PREFIX_PATH="$venv" CMAKE_GENERATOR=Ninja
 if ! "$python" -m colcon --log-base "$venv/log" build \
-    --base-paths src --build-base "$venv/build" --install-base "$venv" --merge-install \
+    --base-paths src setup --build-base "$venv/build" --install-base "$venv" --merge-install \
     --event-handlers console_direct- console_cohesion- summary+ \
     --cmake-args -DPython3_EXECUTABLE="$python" -DPYTHON_EXECUTABLE="$python" -DBUILD_TESTING=OFF \
     >"$venv/build.log" 2>&1; then

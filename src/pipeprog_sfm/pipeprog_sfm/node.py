@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
+from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import Path
+from geometry_msgs.msg import Point, Quaternion, Vector3
+from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, PointCloud2
 from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
@@ -22,13 +26,17 @@ from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
-from pipeprog_sfm.board import load_boards
+from pipeprog_sfm.board import load_boards, load_distances
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import FrameTie
+from pipeprog_sfm.motion import Acceleration, Motion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
 from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Ready, Retire, Retired, serve
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
+
+
+MAX_MOTION = 1000  # samples of odometry, TF or IMU that wait for this process: seconds of the fastest
 
 
 class SfmNode(Node):
@@ -36,10 +44,11 @@ class SfmNode(Node):
 
     def __init__(self) -> None:
         super().__init__("sfm")
-        config = declare(self, SfmConfig, extra=("board",))
+        config = declare(self, SfmConfig, extra=("board", "lockstep"))
         board = str(self.declare_parameter("board", "").value)
         boards = load_boards(board) if board else []
-        self._worker = WorkerProcess(self, serve, (config, boards), self._on_event, self._on_death)
+        distances = load_distances(board, boards) if board else []
+        self._worker = WorkerProcess(self, serve, (config, boards, distances), self._on_event, self._on_death)
         self._images: dict[int, CompressedImage] = {}
         self._cameras: dict[int, tuple[str, Camera]] = {}
         self._frame_ids: dict[int, str] = {}
@@ -48,6 +57,9 @@ class SfmNode(Node):
         self._retired = 0
         self._seen = self._done = self._dropped = self._revision = 0
         self._last_stamp = self._map_stamp = self._pose_stamp = 0
+        self._transforms: list[Transform] = []  # since the last keyframe, as are the accelerations
+        self._accelerations: list[Acceleration] = []
+        self._moved = 0
         self._ready = False
         self._status: Status | None = None
         self._finish: tuple[int, Future] | None = None
@@ -62,6 +74,14 @@ class SfmNode(Node):
         )
         self.create_subscription(CameraInfo, "keyframes/camera_info", self._on_camera_info, qos.reliable(MAX_BACKLOG))
         self.create_subscription(msg.KeyframesRetired, "keyframes/retired", self._on_retired, qos.reliable(MAX_BACKLOG))
+        # Live, drivers send best effort and a lost sample is none too many; a recording must lose none.
+        lockstep = bool(self.declare_parameter("lockstep", False).value)
+        source = qos.reliable(MAX_MOTION) if lockstep else qos.sensor(MAX_MOTION)
+        subscribe = partial(self.create_subscription, qos_overriding_options=qos.OVERRIDABLE)
+        subscribe(Odometry, "odometry", self._on_odometry, source)
+        subscribe(Imu, "imu", self._on_imu, source)
+        subscribe(TFMessage, "/tf", partial(self._on_transforms, static=False), source)
+        subscribe(TFMessage, "/tf_static", partial(self._on_transforms, static=True), qos.kept(MAX_MOTION))
         # In a group of its own: while it waits for the end, the other callbacks must run.
         self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
@@ -95,9 +115,48 @@ class SfmNode(Node):
         if self._worker.backlog >= MAX_BACKLOG:
             self._dropped += 1
         else:
-            self._worker.send(Keyframe(stamp, bytes(image.data), camera))
+            self._worker.send(Keyframe(stamp, bytes(image.data), camera, frame_id, self._take_motion()))
         self._retire_when_due()
         self._finish_when_complete()
+
+    def _on_odometry(self, message: Odometry) -> None:
+        pose = message.pose.pose
+        self._move(message.header, message.child_frame_id, pose.position, pose.orientation)
+
+    def _on_transforms(self, message: TFMessage, static: bool) -> None:
+        for transform in message.transforms:
+            edge = transform.transform
+            self._move(transform.header, transform.child_frame_id, edge.translation, edge.rotation, static)
+
+    def _move(self, header: Header, child: str, place: Point | Vector3, turn: Quaternion, static: bool = False) -> None:
+        self._moved += 1
+        values = np.array([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+        if not header.frame_id or not child or not np.isfinite(values).all() or not values[3:].any():
+            self.get_logger().warning(
+                f"a transform from '{header.frame_id}' to '{child}' cannot be used: it wants both names and a rotation",
+                throttle_duration_sec=10.0,
+            )
+            return
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+        stamp = messages.stamp_ns(header.stamp)
+        # tf2 takes names with and without the leading slash of ROS 1 for the same.
+        names = header.frame_id.lstrip("/"), child.lstrip("/")
+        self._transforms.append(Transform(stamp, *names, pose, static))
+
+    def _on_imu(self, message: Imu) -> None:
+        self._moved += 1
+        force = message.linear_acceleration
+        values = np.array([force.x, force.y, force.z])
+        # REP 145: -1 says that there are no accelerations.
+        if message.linear_acceleration_covariance[0] >= 0 and np.isfinite(values).all():
+            stamp = messages.stamp_ns(message.header.stamp)
+            self._accelerations.append(Acceleration(stamp, message.header.frame_id.lstrip("/"), values))
+
+    def _take_motion(self) -> Motion:
+        motion = Motion(tuple(self._transforms), tuple(self._accelerations))
+        self._transforms, self._accelerations = [], []
+        return motion
 
     def _on_retired(self, message: msg.KeyframesRetired) -> None:
         self._retirements.append(message)
@@ -123,7 +182,7 @@ class SfmNode(Node):
     def _finish_when_complete(self) -> None:
         if self._finish is not None and not self._finish_sent and self._seen >= self._finish[0]:
             self._finish_sent = True
-            self._worker.send(Finish())
+            self._worker.send(Finish(self._take_motion()))
 
     def _on_event(self, event: Ready | KeyframeDone | Retired | MapReady | Finished) -> None:
         if isinstance(event, Ready):
@@ -209,6 +268,7 @@ class SfmNode(Node):
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         status = self._status
         values: dict[str, Any] = {"keyframes": self._seen, "waiting": self._worker.backlog, "dropped": self._dropped}
+        values |= {"motion": self._moved}
         if status is None:
             return DiagnosticStatus.OK, "waiting for keyframes" if self._ready else "starting", values
         values |= {

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.board import Board
+from pipeprog_sfm.board import Board, Distance
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.dense import DenseMapper, EncodedImage, centre
 from pipeprog_sfm.fusion import FusedCloud
 from pipeprog_sfm.mapper import FrameTie, KeyframeReport, Mapper
+from pipeprog_sfm.motion import Motion
 from pipeprog_sfm.scale import NoScaleError, ScaleEstimate
 
 FloatArray = NDArray[np.float64]
@@ -61,9 +62,9 @@ class MetricMap:
 class Reconstruction:
     """Sparse poses, scale, depth maps and fusion over a stream of keyframes."""
 
-    def __init__(self, config: SfmConfig, boards: Sequence[Board]) -> None:
+    def __init__(self, config: SfmConfig, boards: Sequence[Board], distances: Sequence[Distance] = ()) -> None:
         self._mapper = Mapper(config.mapper, config.seed)
-        self._targets = BoardTracker(boards, config.board)
+        self._targets = BoardTracker(boards, config.board, distances, config.odometry)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
         self._pending: tuple[ScaleEstimate, Trajectory, Future[FusedCloud]] | None = None
@@ -72,8 +73,8 @@ class Reconstruction:
         self._reason = "no keyframe has been registered yet"
         self._problem = ""
 
-    def add(self, stamp: int, encoded: bytes, camera: Camera) -> KeyframeReport:
-        """Takes a keyframe (JPEG or PNG bytes, stamp in ns); raises InputError when it cannot be decoded."""
+    def add(self, stamp: int, encoded: bytes, camera: Camera, frame: str = "") -> KeyframeReport:
+        """Takes a keyframe (JPEG or PNG bytes, stamp in ns, the camera's frame); InputError when it is damaged."""
         gray = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
         if gray is None:
             raise InputError("the image is damaged: it is left out")
@@ -84,7 +85,7 @@ class Reconstruction:
             )
         self._images[stamp] = EncodedImage(encoded, camera)
         # Features and targets are measured in the image as it is: their points are undistorted, not resampled.
-        if self._targets.add(stamp, gray, camera):
+        if self._targets.add(stamp, gray, camera, frame):
             self._scaled = -1
         return self._mapper.add(stamp, gray, camera)
 
@@ -92,6 +93,10 @@ class Reconstruction:
         """Starts the depth maps that can be made by now; they are worked off in a thread of their own."""
         poses = self._mapper.camera_from_model()
         self._dense.update(poses, self._images, self._mapper.points_seen, complete=False)
+
+    def move(self, motion: Motion) -> None:
+        """Takes what odometry, TF and IMU have told since the last call."""
+        self._targets.move(motion)
 
     def skip(self, stamp: int, problem: str) -> None:
         """Notes a keyframe that could not be used."""

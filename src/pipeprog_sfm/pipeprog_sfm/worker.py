@@ -5,14 +5,15 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.board import Board
+from pipeprog_sfm.board import Board, Distance
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import FrameTie
+from pipeprog_sfm.motion import Motion
 from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
 from pipeprog_sfm.warm_up import warm_up
 
@@ -22,11 +23,13 @@ POLL_SECONDS = 0.1  # between looks at the map under way
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Command: take this keyframe; `encoded` holds JPEG or PNG bytes."""
+    """Command: take this keyframe and the motion before it; `encoded` holds JPEG or PNG bytes."""
 
     stamp: int
     encoded: bytes
     camera: Camera
+    frame: str = ""
+    motion: Motion = field(default_factory=Motion)
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class Retire:
 @dataclass(frozen=True)
 class Finish:
     """Command: no more keyframes come; publish the final map."""
+
+    motion: Motion = field(default_factory=Motion)
 
 
 @dataclass(frozen=True)
@@ -80,17 +85,18 @@ class Finished:
     problem: str
 
 
-def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board]) -> None:
+def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board], distances: Sequence[Distance]) -> None:
     """Works off commands from `connection` until it closes."""
     warm_up(config)
     connection.send(Ready())
-    reconstruction = Reconstruction(config, boards)
+    reconstruction = Reconstruction(config, boards, distances)
     since_map, idle_since = 0, time.monotonic()
     while True:
         busy = since_map > 0 or reconstruction.is_mapping
         if connection.poll(POLL_SECONDS if busy else None):
             command = connection.recv()
             if isinstance(command, Finish):
+                reconstruction.move(command.motion)
                 connection.send(_finish(connection, reconstruction))
                 continue
             if isinstance(command, Keyframe):
@@ -112,8 +118,9 @@ def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board]) ->
 
 
 def _add(reconstruction: Reconstruction, keyframe: Keyframe) -> KeyframeDone:
+    reconstruction.move(keyframe.motion)
     try:
-        reconstruction.add(keyframe.stamp, keyframe.encoded, keyframe.camera)
+        reconstruction.add(keyframe.stamp, keyframe.encoded, keyframe.camera, keyframe.frame)
     except InputError as error:
         reconstruction.skip(keyframe.stamp, str(error))
     trajectory = None
