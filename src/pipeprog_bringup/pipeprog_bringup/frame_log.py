@@ -17,7 +17,7 @@ class FrameLog:
         self._rows: list[FrameRow | None] = []
         self._pending: defaultdict[int, deque[int]] = defaultdict(deque)
         self._first: dict[int, int] = {}
-        self._overlap: dict[int, tuple[float, float, bool]] = {}
+        self._overlap: dict[int, tuple[float, float, int, bool]] = {}
 
     @property
     def in_flight(self) -> int:
@@ -54,9 +54,9 @@ class FrameLog:
         elif row.stamp in self._first:
             self._rows[self._first[row.stamp]] = row
 
-    def overlap(self, stamp: int, overlap: float, cell_overlap: float, registered: bool) -> None:
+    def overlap(self, stamp: int, overlap: float, cell_overlap: float, tie_points: int, registered: bool) -> None:
         """The SfM measured how well a keyframe is tied into the model (Ov_N, Eq. 1 of the paper; the same in cells)."""
-        self._overlap[stamp] = overlap, cell_overlap, registered
+        self._overlap[stamp] = overlap, cell_overlap, tie_points, registered
 
     def rows(self) -> list[FrameRow]:
         """One row a frame that was considered, keyframes with their last overlap."""
@@ -65,10 +65,10 @@ class FrameLog:
             if row is None:
                 continue
             if row.chosen and row.stamp in self._overlap:
-                overlap, cells, registered = self._overlap[row.stamp]
+                overlap, cells, tie_points, registered = self._overlap[row.stamp]
                 row = replace(row, registered=registered)
                 if registered:
-                    row = replace(row, overlap_n=overlap, cell_overlap=cells)
+                    row = replace(row, overlap_n=overlap, cell_overlap=cells, tie_points=tie_points)
             result.append(row)
         return result
 

@@ -364,7 +364,7 @@ class _Run:
         self._answered = message.keyframes_considered
         for image in message.images:
             stamp = messages.stamp_ns(image.stamp)
-            self.log.overlap(stamp, image.overlap, image.cell_overlap, image.registered)
+            self.log.overlap(stamp, image.overlap, image.cell_overlap, image.tie_points, image.registered)
 
     def _on_status(self, message: msg.SfmStatus) -> None:
         self._status = message

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 
 FRAME_COLUMNS = (
     *("stamp", "chosen", "reason", "overlap_n", "overlap_predicted", "parallax", "sharpness", "registered"),
-    "cell_overlap",
+    *("cell_overlap", "tie_points"),
 )
 _PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "pycolmap", "mcap", "ros-rclpy")
 
@@ -54,6 +54,7 @@ class FrameRow:
     sharpness: float | None = None
     registered: bool | None = None
     cell_overlap: float | None = None
+    tie_points: int | None = None
 
 
 def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress], scale: Scale) -> None:
@@ -111,7 +112,8 @@ def write_frames(path: Path, rows: Iterable[FrameRow]) -> None:
             cells = ["" if value is None or not np.isfinite(value) else f"{value:.4f}" for value in numbers]
             registered = "" if row.registered is None else int(row.registered)
             cell_overlap = "" if row.cell_overlap is None else f"{row.cell_overlap:.4f}"
-            writer.writerow([row.stamp, int(row.chosen), row.reason, *cells, registered, cell_overlap])
+            tie_points = "" if row.tie_points is None else row.tie_points
+            writer.writerow([row.stamp, int(row.chosen), row.reason, *cells, registered, cell_overlap, tie_points])
 
 
 def write_config(path: Path, config: dict[str, Any]) -> None:
