@@ -27,7 +27,7 @@ IMAGE_CACHE = 12  # decoded keyframes at working resolution: a depth map's neigh
 NICENESS = 5  # a third of the mapper's share where they compete: its poses are waited for, the cloud is not
 MIN_POINTS = 10  # of a keyframe, to know the range of its depths
 SAMPLE = 200  # of them, to know what other keyframes see of the same
-SAME_SIDE = np.radians(20.0)  # of a surface: from farther round, a pipe shows other parts
+SAME_SIDE = np.radians(8.0)  # of a surface: farther round (0.14 of the depth), a view is a witness of its own
 SAME_SCALE = 1.5  # of an image: from nearer, more is to be seen
 
 
@@ -55,9 +55,9 @@ class DenseMapper:
 
     def __init__(self, stereo: StereoConfig, fusion: FusionConfig) -> None:
         self._stereo_config, self._fusion_config = stereo, fusion
-        # min_views must agree on a point, and one more may miss it: on a straight walk a point is in sight of
-        # 1 / (1 - overlap) depth maps.
-        self._overlap = 1.0 - 1.0 / (fusion.min_views + 1)
+        # On a straight walk a point is in sight of 1 / (1 - overlap) depth maps, twice as many as must agree on it: to
+        # the other half it may be hidden, slanting or blurred.
+        self._overlap = 1.0 - 1.0 / (2 * fusion.min_views)
         self._image = lru_cache(maxsize=IMAGE_CACHE)(_decode)
         self._depths: dict[int, Future[_Depth]] = {}
         self._waiting: deque[Callable[[], None]] = deque()
