@@ -13,6 +13,8 @@ from pipeprog_frames.tracker import MIN_CORNERS, Track, Tracker, corners, sharpn
 
 NAN = float("nan")
 DAMAGED = "damaged image"
+STRANGE = "shows nothing of the frames before and after it"
+JUMP = "shows nothing of the frames before it"
 # The Laplacian's variance of neighbouring sharp frames differs by content alone by a fifth or so.
 BLUR_TOLERANCE = 0.8
 MAX_UNSEEN = 200_000_000  # ns between two looks: a turn of 90 degrees a second is caught within the tracker's reach
@@ -59,14 +61,19 @@ class FrameSelector:
     Decoding is most of the cost. While the motion so far says that a keyframe is not due for long, frames are held
     without a look; should one turn out to be due, those that were passed over are looked at in turn, as if each had
     been looked at on arrival.
+
+    A frame that shows nothing of what came before is a jump of the camera or an accident: a hand before the lens, a
+    damaged image. It is a keyframe unless the view from before it comes back within the window.
     """
 
     def __init__(self, config: FramesConfig, camera: Camera) -> None:
         self._config = config
         self._parallax_base = config.parallax_max * camera.width
+        self._camera = camera
         self._tracker = Tracker(camera)
         self._window: deque[_Candidate] = deque()  # looked at, not due
         self._unseen: deque[_Candidate] = deque()  # later than those
+        self._strangers: deque[_Candidate] = deque()  # later than all: nothing in them has been seen before
         self._keyframe: int | None = None
         self._last_stamp: int | None = None
         self._pace = 0.0  # share of the way to the next keyframe, per ns
@@ -99,14 +106,9 @@ class FrameSelector:
     def flush(self) -> list[Decision]:
         """Decides on the frames that are still open: the last one ends the map, so it is kept if it adds anything."""
         decisions = self._catch_up(self._unseen.pop()) if self._unseen else []
-        for candidate in self._window:
-            half_way = 0.5 * (1.0 + self.overlap_min)
-            if candidate is self._window[-1] and candidate.track.overlap < half_way:
-                decisions.append(candidate.decided(True, "last frame"))
-            else:
-                decisions.append(candidate.decided(False, "overlap suffices"))
-        self._window.clear()
-        return decisions
+        decisions += [stranger.decided(False, STRANGE) for stranger in self._strangers]
+        self._strangers.clear()
+        return decisions + self._leave_window()
 
     def _catch_up(self, candidate: _Candidate) -> list[Decision]:
         """Looks at a frame, and before it at those passed over when it turns out that they matter."""
@@ -128,7 +130,7 @@ class FrameSelector:
         if self._keyframe is None:
             return [self._start(candidate, gray)]
         candidate.track = self._tracker.track(gray)
-        return self._settle(candidate, gray)
+        return self._judge_strangers(candidate, gray) + self._settle(candidate, gray)
 
     def _settle(self, candidate: _Candidate, gray: GrayImage) -> list[Decision]:
         """What follows from a frame that the tracker has just been led into."""
@@ -136,6 +138,11 @@ class FrameSelector:
         if candidate.track.tracked < MIN_CORNERS and len(corners(gray)) < MIN_CORNERS:
             self._tracker.undo()
             return [candidate.decided(False, "too few features")]
+        if not candidate.track.tracked:
+            self._tracker.undo()
+            self._strangers.append(candidate)
+            self._look_at = candidate.stamp
+            return self._trim()
         decisions: list[Decision] = []
         if self._is_due(candidate.track) and self._window:
             decisions += self._close_window()
@@ -156,6 +163,26 @@ class FrameSelector:
         self._tracker.start(gray)
         self._keyframe = self._look_at = candidate.stamp
         return candidate.decided(True, "first frame")
+
+    def _judge_strangers(self, candidate: _Candidate, gray: GrayImage) -> list[Decision]:
+        """What a frame says of those that showed nothing known; leads the tracker into it from the last of them."""
+        if not self._strangers:
+            return []
+        if candidate.track.tracked:
+            decisions = [stranger.decided(False, STRANGE) for stranger in self._strangers]
+            self._strangers.clear()
+            return decisions
+        last = self._strangers[-1].gray
+        assert last is not None
+        probe = Tracker(self._camera)
+        probe.start(last)
+        if not probe.track(gray).tracked:
+            return []
+        decisions = self._leave_window() + [stranger.decided(True, JUMP) for stranger in self._strangers]
+        self._carry_on(self._strangers[-1], last)
+        self._strangers.clear()
+        candidate.track = self._tracker.track(gray)
+        return decisions
 
     def _is_due(self, track: Track) -> bool:
         return track.overlap < self.overlap_min or track.parallax > self._parallax_max
@@ -191,9 +218,20 @@ class FrameSelector:
     def _trim(self) -> list[Decision]:
         """Decides on what is too old to be chosen any more."""
         decisions = []
-        while len(self._window) + len(self._unseen) > self._config.window:
-            held = self._window or self._unseen
-            decisions.append(held.popleft().decided(False, "overlap suffices"))
+        while len(self._window) + len(self._unseen) + len(self._strangers) > self._config.window:
+            if self._window or self._unseen:
+                held = self._window or self._unseen
+                decisions.append(held.popleft().decided(False, "overlap suffices"))
+            else:
+                decisions.append(self._strangers.popleft().decided(True, JUMP))
+        return decisions
+
+    def _leave_window(self) -> list[Decision]:
+        """Decides on the window where nothing follows on from it: its last frame is kept if it adds anything."""
+        decisions = [candidate.decided(False, "overlap suffices") for candidate in self._window]
+        if self._window and self._window[-1].track.overlap < 0.5 * (1.0 + self.overlap_min):
+            decisions[-1] = self._window[-1].decided(True, "the last that shows this view")
+        self._window.clear()
         return decisions
 
     def _close_window(self) -> list[Decision]:

@@ -142,6 +142,53 @@ def test_relief_asks_for_fewer_keyframes(wall: NDArray[np.uint8]) -> None:
     assert counts[0] > counts[1] > counts[2] > 3
 
 
+def test_a_burst_of_damaged_frames_costs_those_alone(wall: NDArray[np.uint8]) -> None:
+    images: list[NDArray[np.uint8] | None] = [pan(wall, 3 * index) for index in range(90)]
+    plain = sum(d.chosen for d in run(FrameSelector(FramesConfig(), CAMERA), images, fps=30.0))
+    rng = np.random.default_rng(5)
+    for index in (30, 31, 32, 33, 60):
+        images[index] = cv2.resize(rng.integers(0, 255, (23, 40), dtype=np.uint8), (WIDTH, HEIGHT), interpolation=0)
+    decisions = run(FrameSelector(FramesConfig(), CAMERA), images, fps=30.0)
+    assert len(decisions) == 90
+    assert not any(decisions[index].chosen for index in (30, 31, 32, 33, 60))
+    assert abs(sum(decision.chosen for decision in decisions) - plain) <= 1
+
+
+@pytest.mark.parametrize("step", [120, 400])
+def test_jumps_beyond_the_trackers_reach_are_keyframes(wall: NDArray[np.uint8], step: int) -> None:
+    """A turning robot at 2 Hz: what the tracker cannot follow the features of the SfM may."""
+    if step == 120:
+        images = [pan(wall, step * index) for index in range(13)]
+        decisions = run(FrameSelector(FramesConfig(), CAMERA), images, fps=2.0)
+        assert sum(decision.chosen for decision in decisions) >= 7
+    images = [pan(wall, 0)] * 10 + [pan(wall, step)] * 10 + [pan(wall, 3 * step)] * 10
+    decisions = run(FrameSelector(FramesConfig(), CAMERA), images)
+    assert [index for index, decision in enumerate(decisions) if decision.chosen] == [0, 10, 20]
+
+
+def test_a_lens_covered_while_walking_leaves_one_gap(wall: NDArray[np.uint8]) -> None:
+    rng = np.random.default_rng(6)
+    images: list[NDArray[np.uint8] | None] = [pan(wall, 2 * index) for index in range(240)]
+    for index in range(90, 150):
+        images[index] = np.clip(rng.normal(4, 0.5, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8)
+    decisions = run(FrameSelector(FramesConfig(), CAMERA), images, fps=30.0)
+    chosen = [index for index, decision in enumerate(decisions) if decision.chosen]
+    assert not set(chosen) & set(range(90, 150))
+    assert 150 in chosen
+    assert any(66 < index < 90 for index in chosen), "and the gap is as short as can be"
+
+
+def test_a_stop_of_twenty_seconds_in_an_unsteady_hand_adds_two_frames_at_most(wall: NDArray[np.uint8]) -> None:
+    rng = np.random.default_rng(7)
+    sway = 4 * np.sin(np.arange(600) / 9) + rng.normal(0, 0.5, 600)
+    images = []
+    for index in range(600):
+        noise = rng.normal(0, 2, (HEIGHT, WIDTH))
+        images.append(np.clip(pan(wall, 200 + sway[index]) + noise, 0, 255).astype(np.uint8))
+    decisions = run(FrameSelector(FramesConfig(), CAMERA), images, fps=30.0)
+    assert sum(decision.chosen for decision in decisions) <= 1 + 2
+
+
 def test_stamps_that_run_backwards_or_repeat(wall: NDArray[np.uint8]) -> None:
     selector = FrameSelector(FramesConfig(), CAMERA)
     selector.consider(10, load(pan(wall, 0)))
