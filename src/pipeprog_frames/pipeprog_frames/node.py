@@ -173,8 +173,8 @@ class FramesNode(Node):
             self._decide(self._policy.flush())
         while self._publish_changes() and self._is_answered():
             self._apply_feedback(len(self._published))
-            decisions = self._policy.settle() if self._policy is not None else []
-            self._decide(decisions)
+            if self._policy is not None:
+                self._revise(self._policy.settle())
             if not self._changes:
                 self._end()
                 return
@@ -231,16 +231,18 @@ class FramesNode(Node):
         return None
 
     def _decide(self, decisions: list[Decision]) -> None:
-        """Announces decisions and queues the changes that follow from them."""
-        retired = []
+        """Announces what became of frames and queues those that were chosen."""
         for decision in decisions:
             self._damaged += decision.reason == DAMAGED
             self._announce(decision)
             frame = self._ring.get(decision.stamp) if decision.chosen else None
             if frame is not None:
                 self._changes.append(frame)
-            elif decision.stamp in self._published:
-                retired.append(decision)
+
+    def _revise(self, decisions: list[Decision]) -> None:
+        """Announces second thoughts: frames to be added, and keyframes to be retired."""
+        self._decide(decisions)
+        retired = [decision for decision in decisions if not decision.chosen]
         if retired:
             self._changes.append(retired)
 
@@ -294,7 +296,7 @@ class FramesNode(Node):
         while self._feedback and self._feedback[0].keyframes_considered <= count:
             ties = [_tie(image) for image in self._feedback.popleft().images]
             if self._policy is not None:
-                self._decide(self._policy.answer(ties))
+                self._revise(self._policy.answer(ties))
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         values = {

@@ -8,6 +8,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_frames.decoding import GrayImage, decode_reduced
 from pipeprog_frames.tracker import MIN_CORNERS, corners, sharpness
 
@@ -80,12 +81,19 @@ class FrameFile(FrameRing):
         self._end = 0
 
     def add(self, frame: Frame) -> None:
-        """Stores a frame whose stamp is later than all others; others are refused."""
-        if frame.stamp in self._frames:
+        """Stores a frame whose stamp is later than all others; others are refused. Raises InputError on a full disk."""
+        if frame.stamp in self._places:
             return
         super().add(replace(frame, encoded=b""))
         self._file.seek(self._end)
-        self._file.write(frame.encoded)
+        try:
+            self._file.write(frame.encoded)
+            self._file.flush()
+        except OSError as error:
+            raise InputError(
+                f"the recording's images do not fit into a file in {tempfile.gettempdir()} ({error.strerror}): "
+                "make room there, or let TMPDIR name a folder that has it"
+            ) from None
         self._places[frame.stamp] = self._end, len(frame.encoded)
         self._end += len(frame.encoded)
 

@@ -168,6 +168,18 @@ def test_whatever_the_format_says(stage: Callable[..., Stage], wall: NDArray, ki
     scene.spin_until(lambda: len(scene.keyframes) >= 6)
 
 
+def test_an_image_that_comes_twice_takes_no_keyframe_back(stage: Callable[..., Stage], wall: NDArray) -> None:
+    scene = stage()
+    for index in range(6):
+        stamp = START + index * 200_000_000
+        for _ in range(2):
+            scene.show(stamp, compressed(stamp, view(wall, 80 * index)))
+    scene.spin_until(lambda: len(scene.decisions) >= 11)
+    assert sum(decision.reason == "stamp repeats" for decision in scene.decisions) == 6
+    assert len(set(scene.chosen())) == len(scene.chosen()) >= 5
+    assert not scene.retired
+
+
 def test_live_a_lagging_sfm_gets_fewer_keyframes_and_people_are_told(
     stage: Callable[..., Stage], wall: NDArray
 ) -> None:
