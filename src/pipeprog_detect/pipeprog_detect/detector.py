@@ -19,7 +19,8 @@ from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
 from pipeprog_detect.refinement import Jury, Measured
 from pipeprog_detect.runs import elbows, join, near, spanning
-from pipeprog_detect.verify import Candidate, measure, outwardness, own_points, settle, thin_start
+from pipeprog_detect.surroundings import Surroundings
+from pipeprog_detect.verify import Candidate, measure, own_points, settle, thin_start
 
 # Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1 to 2 times as large. Fine to coarse, each on
 # what the ones before have not explained: a coarse patch may span two pipes of a rack, a fine one may not. The finest
@@ -28,8 +29,6 @@ _SCALES = (0.028, 0.04, 0.056, 0.08, 0.113, 0.16, 0.02)
 _POINTS_PER_SCALE = 7.0
 # Stereo is rougher on pipes, curved and glossy, than on the walls that the noise is read from.
 _STEREO_ON_PIPES = 2.0
-# Mean cosine between the normals of a pipe and those of its points: noise turns a thin pipe's by less than 60 deg.
-_OUTWARD = 0.5
 # Candidates that the images judge may be so many times as rough as pipes that the cloud alone must vouch for.
 _PROPOSED = 2.0
 # Pipes up to this radius [m] are sought as lines of points, in neighbourhoods several times as wide.
@@ -66,13 +65,14 @@ def detect(
     sigma = normals.estimate_noise(tree)
     widest = 1.5 * max(planned.outer_radius for planned in bill.classes)
     report(0.15, "finding walls")
-    _, on_plane = background.find_planes(tree, sigma, widest)
+    walls, on_plane = background.find_planes(tree, sigma, widest)
     tree = tree.subset(~on_plane)
     outward = None if cloud.normals is None else np.asarray(cloud.normals, float)[finite][tree.order]
+    around = Surroundings(tree, outward, walls)
     if config.concave:
         report(0.3, "looking for pipes seen from inside")
         bores = [radius for planned in bill.classes for radius, _ in planned.bores]
-        seen = find_concave(tree, outward, sigma, (0.7 * min(bores), 1.5 * max(bores)), config)
+        seen = find_concave(tree, around, sigma, (0.7 * min(bores), 1.5 * max(bores)), config)
         return _product([Measured(each, each.cylinder, each.radius_sigma) for each in seen], bill, shift, config)
     planned_radii = [planned.outer_radius for planned in bill.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
@@ -81,7 +81,7 @@ def detect(
     noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)
     planes = [replace(plane, point=plane.point - shift) for plane in parse_planes(config.plane)] if config.plane else []
-    candidates = find_candidates(tree, outward, noise, radius_range, planned_radii, planes, config, jury, report)
+    candidates = find_candidates(tree, around, noise, radius_range, planned_radii, planes, config, jury, report)
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
     report(0.95, "looking for thin pipes in the keyframes")
@@ -92,7 +92,7 @@ def detect(
 
 def find_candidates(
     tree: Octree,
-    outward: FloatArray | None,
+    around: Surroundings,
     sigma: float,
     radius_range: tuple[float, float],
     planned_radii: Sequence[float],
@@ -103,15 +103,15 @@ def find_candidates(
 ) -> list[Candidate]:
     """Accepted cylinders of the tree's points, none sharing points with another.
 
-    Where their normals `outward` (N, 3), towards the cameras, are known, a corner or a hollow is none: it faces its
-    own axis. What is too rough for the cloud alone is put to the images, where there are any.
+    What is around them may make a corner or a hollow of them. What is too rough for the cloud alone is put to the
+    images, where there are any.
     """
     free = np.ones(len(tree.points), bool)
     accepted: list[Candidate] = []
 
     def consider(hypothesis: Hypothesis) -> None:
         candidate = measure(tree, free, hypothesis, sigma)
-        if candidate is None or (outward is not None and outwardness(tree, outward, candidate) < _OUTWARD):
+        if candidate is None or around.contradict(candidate):
             return
         if is_pipe(candidate, sigma, config) or (
             is_pipe(candidate, sigma, config, _PROPOSED) and jury.vouches_for(candidate)

@@ -15,7 +15,8 @@ from pipeprog_detect.fit import fit_cylinder
 from pipeprog_detect.hypotheses import Hypothesis
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cylinder, FloatArray
-from pipeprog_detect.verify import Candidate, measure, outwardness
+from pipeprog_detect.surroundings import Surroundings
+from pipeprog_detect.verify import Candidate, measure
 
 # Of all pairs of sites a hundredth lie on one pipe even where nine tenths of the sites are stray: 200 good ones remain.
 _PAIRS = 20_000
@@ -38,14 +39,14 @@ _ROUGHEST = 0.05
 
 def find_concave(
     tree: Octree,
-    outward: FloatArray | None,
+    around: Surroundings,
     sigma: float,
     radius_range: tuple[float, float],
     config: DetectConfig,
 ) -> list[Candidate]:
     """Cylinders of the tree's points that are seen from inside, the best supported first.
 
-    outward (N, 3) are the points' normals towards the sensor, None where the cloud has none; sigma [m] is its noise.
+    Where the normals `around` are known they must point to the axis; sigma [m] is the noise.
     """
     free = np.ones(len(tree.points), bool)
     found: list[Candidate] = []
@@ -55,7 +56,7 @@ def find_concave(
         ]
         good = [each for each in measured if each is not None and is_concave_pipe(each, sigma, config)]
         good = [each for each in good if _beyond(tree, each) < _STRAY * each.points]
-        good = [each for each in good if outward is None or outwardness(tree, outward, each) < 0.0]
+        good = [each for each in good if (around.outwardness(each) or -1.0) < 0.0]
         if not good:
             return found
         best = max(good, key=lambda candidate: candidate.points)

@@ -160,21 +160,6 @@ def thin_start(
     return best
 
 
-def outwardness(tree: Octree, normals: FloatArray, candidate: Candidate) -> float:
-    """Mean cosine between the normals towards the sensor (N, 3) of the tree's points on a cylinder and its own.
-
-    Near 1 on a pipe seen from outside, near -1 on a corner or a pipe seen from inside.
-    """
-    cylinder = candidate.cylinder
-    rows = tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)
-    points = tree.points[rows]
-    on_surface = np.abs(_signed_distance(points, cylinder)) < 3.0 * candidate.band
-    offset = points[on_surface] - cylinder.start
-    radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
-    cosine = np.einsum("ij,ij->i", radial, normals[rows[on_surface]]) / (np.linalg.norm(radial, axis=1) + 1e-12)
-    return float(cosine.mean()) if len(cosine) else 0.0
-
-
 def own_points(points: FloatArray, cylinder: Cylinder, others: Sequence[Cylinder]) -> FloatArray:
     """The points (N, 3) that lie no nearer to the surface of one of the others than to the cylinder's."""
     mine = np.abs(_signed_distance(points, cylinder))

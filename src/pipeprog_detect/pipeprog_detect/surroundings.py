@@ -1,0 +1,73 @@
+"""What the points around a cylinder say about its side: a pipe is seen from outside and rounds no corner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeprog_detect.background import Plane
+from pipeprog_detect.octree import IntArray, Octree
+from pipeprog_detect.pipe import FloatArray
+from pipeprog_detect.verify import Candidate
+
+# Mean cosine between the normals of a pipe and those of its points: noise turns a thin pipe's by less than 60 deg.
+_OUTWARD = 0.5
+# A plane is tangent to a cylinder along it within these angles, and at its radius but for this share and the noise.
+_ALONG = float(np.sin(np.radians(6.0)))
+_TANGENT = 0.15
+# Planes that meet at less than 30 deg make no corner.
+_CORNER = float(np.cos(np.radians(30.0)))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The points beside large planes, their normals (N, 3) towards the sensor (None: not known), and the planes."""
+
+    tree: Octree
+    outward: FloatArray | None
+    planes: Sequence[Plane]
+
+    def outwardness(self, candidate: Candidate) -> float | None:
+        """Mean cosine between the normals of the points on a cylinder and its own, None where they are not known.
+
+        Near 1 on a pipe seen from outside, near -1 in a corner and on a pipe seen from inside.
+        """
+        if self.outward is None:
+            return None
+        rows, radial = self._surface(candidate)
+        return float(np.einsum("ij,ij->i", radial, self.outward[rows]).mean()) if len(rows) else 0.0
+
+    def contradict(self, candidate: Candidate) -> bool:
+        """Whether they make it no pipe: it is hollow, or rounds the edge or the corner of two planes.
+
+        Such a rounding is tangent to both planes, and lies where they would meet; a pipe in a corner shows its other
+        side.
+        """
+        outwardness = self.outwardness(candidate)
+        if outwardness is not None and outwardness < _OUTWARD:
+            return True
+        cylinder = candidate.cylinder
+        middle = 0.5 * (cylinder.start + cylinder.end)
+        allowed = _TANGENT * cylinder.radius + 3.0 * candidate.band
+        feet = []
+        for plane in self.planes:
+            away = plane.offset - float(plane.normal @ middle)
+            if abs(plane.normal @ cylinder.axis) < _ALONG and abs(abs(away) - cylinder.radius) < allowed:
+                feet.append(np.sign(away) * plane.normal)
+        corners = [one + other for k, one in enumerate(feet) for other in feet[:k] if abs(float(one @ other)) < _CORNER]
+        if not corners:
+            return False
+        front = self._surface(candidate)[1].mean(axis=0)
+        return any(float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner) for corner in corners)
+
+    def _surface(self, candidate: Candidate) -> tuple[IntArray, FloatArray]:
+        """Rows of the points on the cylinder's surface and the unit vectors (K, 3) from its axis to them."""
+        cylinder = candidate.cylinder
+        rows = self.tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)
+        offset = self.tree.points[rows] - cylinder.start
+        radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+        distance = np.linalg.norm(radial, axis=1)
+        near = np.abs(distance - cylinder.radius) < 3.0 * candidate.band
+        return rows[near], radial[near] / (distance[near] + 1e-12)[:, None]
