@@ -31,8 +31,10 @@ ROBUST, FLOOR = 0.3, 0.1
 # A tenth of the blur remains as the limb model's own error, common to all views [px]; where the outline is not seen,
 # edges of texture take its place, spread evenly within the robust loss.
 MODEL_ERROR, CLUTTER_ERROR = 0.05, ROBUST / np.sqrt(3.0)
-# A planned radius is that of the pipe within so much, make and edges included.
-KNOWN_RADIUS = 0.08
+# A pipe of a known radius has it within so much, and its axis may lie so many radii aside: it is sought anew.
+KNOWN_RADIUS, KNOWN_AXIS = 0.02, 0.5
+# ... and held to so much [m] until its own edges are found.
+RADIUS_HELD = 1e-4
 # Where the vote cannot tell, so many candidates compete on sub-pixel edges.
 CANDIDATES = 3
 # Edges count within so many pixels of the vote's and of the refined outlines.
@@ -40,6 +42,8 @@ COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
 MIN_STATIONS = 20
 # A pipe of which a piece is known is followed so many times, each time as far again.
 MAX_GROWTH = 4
+# Where more of it has so much less support, radius and axis are taken from what was known before.
+WORSE = 0.9
 # Cylinders that are not there stay under 0.1 (see `support`); the stated sigma grows where little is seen.
 MIN_SUPPORT = 0.15
 
@@ -75,14 +79,16 @@ def refine(
     config: ContourConfig,
     planned_radii: Sequence[float] = (),
     follow: bool = True,
+    known_radius: bool = False,
     depth_sigma: float = 0.0,
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
     `initial_radius_sigma` [m] is the standard deviation of the given radius; that of the axis is taken as twice as
     much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the
-    pipe is made as long as its outlines are seen, and its ends are looked for. Where `depth_sigma` [m] is given, it is
-    the radius that is known, and the distance from the cameras only to so much.
+    pipe is made as long as its outlines are seen, and its ends are looked for. With `known_radius`
+    outlines of other radii are not looked for; `depth_sigma` [m] is what the distance from the cameras is known to,
+    where that is worse.
 
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
@@ -91,7 +97,8 @@ def refine(
     if not config.enabled or not views:
         return None
     basis = frame(cylinder, viewing_direction(cylinder, views))
-    candidates = _vote(cylinder, initial_radius_sigma, depth_sigma, views, others, basis, planned_radii)
+    expected = (initial_radius_sigma, known_radius, depth_sigma)
+    candidates = _vote(cylinder, expected, views, others, basis, planned_radii)
     if not len(candidates):
         return None
     prior = np.zeros(5)
@@ -100,8 +107,13 @@ def refine(
     scene = (views, others, basis)
     still: FloatArray = np.zeros(len(views))
     blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, still, CHUNK)
-    trials = [_improved(cylinder, candidate, scene, blur, prior) for candidate in candidates]
+    held = prior.copy()
+    held[4] = 1.0 / RADIUS_HELD**2 if known_radius else 0.0
+    trials = [_improved(cylinder, candidate, scene, blur, held) for candidate in candidates]
     step, _ = max(trials, key=lambda trial: trial[1])
+    if known_radius:  # its own edges are found first, then they tell the radius
+        first = _fine(moved(cylinder, basis, step), scene, blur, held, step)
+        step = step if first is None else step + first.step
     refined = _fine(moved(cylinder, basis, step), scene, blur, prior, step)
     for _ in range(MAX_GROWTH if follow else 0):
         if refined is None:
@@ -111,11 +123,15 @@ def refine(
             break
         # The direction that was known of the shorter one leaves the longer one's ends uncertain by as much more.
         weaker = prior * (refined.cylinder.length / longer.length) ** 2
-        basis = frame(longer, viewing_direction(longer, views))
-        again = _fine(longer, (views, others, basis), blur, weaker, np.zeros(5))
+        turned = frame(longer, viewing_direction(longer, views))
+        again = _fine(longer, (views, others, turned), blur, weaker, np.zeros(5))
         if again is None or again.share < KEPT * refined.share:
             break
-        refined, scene = again, (views, others, basis)
+        if again.share < WORSE * refined.share:  # there is more of it, but of less use to measure it by
+            refined = replace(refined, cylinder=longer)
+            break
+        refined, basis = again, turned
+        scene = (views, others, basis)
     if refined is None or refined.share < MIN_SUPPORT or refined.cylinder.radius <= 0:
         return None
     ends: list[End | None] = [None, None]
@@ -127,9 +143,10 @@ def refine(
 
 @dataclass(frozen=True)
 class _Refined:
-    """A cylinder after least squares on its sub-pixel edges, their stations and the share of them that support it."""
+    """A cylinder after the steps (5,) of least squares, its stations' edges and the share of them that support it."""
 
     cylinder: Cylinder
+    step: FloatArray
     solution: _Solution
     share: float
     at: Stations
@@ -156,7 +173,7 @@ def _fine(
         step = step + solution.step
         view_offset = solution.view_offset
     share = support_profile(at, hits(at, _moved_by(edges, at, solution), view_offset)).share
-    return _Refined(moved(cylinder, basis, step), solution, share, at, edges)
+    return _Refined(moved(cylinder, basis, step), step, solution, share, at, edges)
 
 
 def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:
@@ -168,14 +185,17 @@ def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:
 
 def _vote(
     cylinder: Cylinder,
-    sigma: float,
-    depth_sigma: float,
+    expected: tuple[float, bool, float],
     views: Sequence[View],
     others: Sequence[Cylinder],
     basis: FloatArray,
     planned_radii: Sequence[float],
 ) -> FloatArray:
-    """Steps (K, 5) of `outline.moved` that most edges of all views support, best first; none where no two see it."""
+    """Steps (K, 5) of `outline.moved` that most edges of all views support, best first; none where no two see it.
+
+    `expected`: standard deviation of the radius, whether it is known for sure, standard deviation of the depth [m].
+    """
+    sigma, known_radius, depth_sigma = expected
     at = stations(cylinder, views, basis, CHUNK)
     at = at.select(visible(cylinder, others, views, at))
     if len(np.unique(at.view)) < 2 or len(np.unique(at.side)) < 2:
@@ -185,9 +205,9 @@ def _vote(
     radius = cylinder.radius
     aside = float(np.clip(3.0 * sigma, 2.0 * pixel, 0.4 * radius))
     thicker = float(np.clip(2.5 * sigma, 2.0 * pixel, 0.3 * radius))
-    deep = aside
-    if depth_sigma > 0:
-        aside, deep, thicker = 0.8 * radius, 2.0 * depth_sigma, KNOWN_RADIUS * radius
+    if known_radius:
+        aside, thicker = KNOWN_AXIS * radius, max(KNOWN_RADIUS * radius, 0.3 * pixel)
+    deep = max(aside, 2.0 * depth_sigma)
     reach = np.array([aside, deep, aside, deep, thicker])
     furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, (aside + thicker) * float(at.gain.max()))
     spacing = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))

@@ -14,6 +14,7 @@ from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.hypotheses import Hypothesis
 from pipeprog_detect.inside import find_concave
+from pipeprog_detect.memory import Memory
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
@@ -44,11 +45,13 @@ def detect(
     config: DetectConfig,
     views: Sequence[View] = (),
     progress: Report | None = None,
+    memory: Memory | None = None,
 ) -> list[Pipe]:
     """Find, measure and classify the pipes of a metric cloud.
 
     Points that are not finite are dropped; a cloud without any others raises InputError. `progress` is called with
-    the share done (0..1) and what is being done.
+    the share done (0..1) and what is being done. With the `memory` of the last map what has not changed is not
+    measured again.
     """
     report = progress or _silent
     points = np.asarray(cloud.points, dtype=np.float64)
@@ -76,7 +79,7 @@ def detect(
         return _product([Measured(each, each.cylinder, each.radius_sigma) for each in seen], bill, shift, config)
     planned_radii = [planned.outer_radius for planned in bill.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
-    jury = Jury(local_views if config.contour.enabled else [], bill, config.contour)
+    jury = Jury(local_views if config.contour.enabled else [], bill, config.contour, memory)
     # A cloud with normals towards cameras is stereo's, too.
     noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)

@@ -9,12 +9,14 @@ import numpy as np
 from pipeprog_detect.edges import outline_edges
 from pipeprog_detect.outline import frame, viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.support import MIN_SHARE, MIN_VIEWS, hits, support_profile
+from pipeprog_detect.support import MIN_SHARE, hits, support_profile
 
+# That a pipe goes on straight is likely beforehand: two views show it.
+MIN_VIEWS = 2
 # A known length tells the direction well enough to look this far ahead, in its own lengths and in metres.
 AHEAD, FARTHEST = 1.0, 1.5
 # Pixels between the places looked at, places that are judged together, and the stations that suffice for one end.
-SPACING, WINDOW, STATIONS = 10, 5, 1200
+SPACING, WINDOW, STATIONS = 6, 5, 1200
 # The pipe goes on where the outlines keep this share of the support that they have along what is known of it, ...
 KEPT = 0.5
 # ... but for gaps up to what a clamp or an occluder explains: so many radii or metres.

@@ -13,6 +13,7 @@ from pipeprog_detect.classify import classify
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import ContourFit, refine
 from pipeprog_detect.extent import Run
+from pipeprog_detect.memory import Memory
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.ribbons import propose
 from pipeprog_detect.verify import Candidate, Evidence
@@ -23,6 +24,8 @@ CONVINCING = 0.5
 SETTLED, MAX_ROUNDS = 0.1, 3
 # Views that suffice to tell a pipe from a shadow; to measure it all are used.
 FEW_VIEWS = 30
+# A planned size so near to a radius that is none is tried, and taken with so much of its outlines' support.
+NEAR_PLANNED, AS_GOOD = 0.15, 0.6
 # Lines are followed up for so many pipes at most, beside so many of the cloud's points.
 MOST_LOST, MOST_POINTS = 40, 600_000
 # What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
@@ -47,8 +50,9 @@ class Measured:
 class Jury:
     """The keyframes, and what they say about candidates; without views the cloud's word stands."""
 
-    def __init__(self, views: Sequence[View], bill: Bill, config: ContourConfig) -> None:
+    def __init__(self, views: Sequence[View], bill: Bill, config: ContourConfig, memory: Memory | None = None) -> None:
         self._views, self._bill, self._config = views, bill, config
+        self._memory = memory or Memory()
         self._few = views[:: -(-len(views) // FEW_VIEWS)] if views else []
         self._refused: list[Cylinder] = []
 
@@ -83,7 +87,7 @@ class Jury:
         for number in order:
             candidate = candidates[number]
             others = [cylinder for other, cylinder in current.items() if other != number]
-            fit = self._refined(candidate, others, self._views)
+            fit = self._as_planned(self._refined(candidate, others, self._views), others)
             if fit is None and not (trusted[number] and (not self.sits or _resolved(candidate))):
                 continue
             # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate or a corner.
@@ -101,6 +105,26 @@ class Jury:
                 found.append(measured)
         return found
 
+    def _as_planned(self, fit: ContourFit | None, others: Sequence[Cylinder]) -> ContourFit | None:
+        """The fit, or one of a planned size near it whose outlines are about as well supported.
+
+        A shadow along a pipe passes for its outline where the cameras never rise or fall. Pipes of sizes that nobody
+        planned are rarer than shadows, but where the planned size finds no outlines of its own the fit stands.
+        """
+        if fit is None or self._is_planned(fit):
+            return fit
+        radius = fit.cylinder.radius
+        planned = [
+            one.outer_radius for one in self._bill.classes if abs(one.outer_radius / radius - 1.0) < NEAR_PLANNED
+        ]
+        for size in planned:
+            start = replace(fit.cylinder, radius=size)
+            sigma = abs(size - radius)
+            again = refine(start, sigma, self._views, others, self._config, (), known_radius=True)
+            if again is not None and self._is_planned(again) and again.support > AS_GOOD * fit.support:
+                return again
+        return fit
+
     def measure_lost(
         self, points: NDArray[np.floating], thickest: float, found: Sequence[Measured]
     ) -> tuple[Measured, ...]:
@@ -115,11 +139,13 @@ class Jury:
         some = points[:: -(-len(points) // MOST_POINTS)].astype(np.float32)
         known = [measured.cylinder for measured in found]
         lost: list[Measured] = []
-        for proposed in propose(self._views, some, thin, known, MOST_LOST):
+        for proposed in propose(self._views, some, thin, known, MOST_LOST, self._memory.edges):
             if _is_known(proposed, known):
                 continue
             sigma = proposed.radius
-            fit = refine(proposed, sigma, self._views, known, self._config, thin, depth_sigma=LINE_DEPTH_SIGMA)
+            fit = refine(
+                proposed, sigma, self._views, known, self._config, thin, known_radius=True, depth_sigma=LINE_DEPTH_SIGMA
+            )
             if fit is None or fit.support < CONVINCING or not self._is_planned(fit) or _is_known(fit.cylinder, known):
                 continue
             if fit.cylinder.length < SLENDER * fit.cylinder.radius:
@@ -142,6 +168,9 @@ class Jury:
         # The surface may lie as far from its points' mean as they scatter: the cloud's sigma knows of noise alone.
         sigma = max(candidate.radius_sigma, candidate.evidence.noise)
         cylinder = candidate.cylinder
+        known, fit = self._memory.recall(cylinder, follow, others, views)
+        if known:
+            return fit
         starts = [cylinder.radius]
         if candidate.blurred:  # the cloud does not know the radius: the planned ones within its reach are tried, too
             starts += [radius for radius in planned_radii if abs(radius - cylinder.radius) < 3.0 * sigma]
@@ -155,7 +184,9 @@ class Jury:
                 start = fit.cylinder
             if fit is not None:
                 fits.append(fit)
-        return max(fits, key=lambda fit: fit.support, default=None)
+        best = max(fits, key=lambda fit: fit.support, default=None)
+        self._memory.keep(cylinder, follow, others, views, best)
+        return best
 
 
 def _is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:

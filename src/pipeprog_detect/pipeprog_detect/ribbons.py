@@ -62,15 +62,22 @@ class _Axes:
 
 
 def propose(
-    views: Sequence[View], points: NDArray[np.float32], radii: Sequence[float], known: Sequence[Cylinder], limit: int
+    views: Sequence[View],
+    points: NDArray[np.float32],
+    radii: Sequence[float],
+    known: Sequence[Cylinder],
+    limit: int,
+    edges: dict[tuple[int, int], FloatArray] | None = None,
 ) -> list[Cylinder]:
     """Up to `limit` cylinders of the given radii [m] that the lines of several views agree on, best seen first.
 
     `points` (N, 3) of the cloud bound the depths of each view. A ribbon of a view and a radius make a cylinder: its
     depth follows from the ribbon's width, and from the centre line of another view's ribbon where the camera has moved
-    across the pipe. Ribbons within the silhouette of a `known` cylinder are left out.
+    across the pipe. Ribbons within the silhouette of a `known` cylinder are left out. `edges` remembers the images'
+    edges by stamp and width.
     """
-    eyes = [eye for eye in (_eye(view, points, radii, known) for view in _few(views, points)) if eye is not None]
+    lines = {} if edges is None else edges
+    eyes = [eye for eye in (_eye(view, points, radii, known, lines) for view in _few(views, points)) if eye is not None]
     parts = [_raised(eye, radius) for eye in eyes for radius in radii]
     parts += [
         _pairs(eye, other, radius)
@@ -126,12 +133,19 @@ def _few(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
     return chosen[:: -(-len(chosen) // MOST_VIEWS)] if chosen else []
 
 
-def _eye(view: View, points: NDArray[np.float32], radii: Sequence[float], known: Sequence[Cylinder]) -> _Eye | None:
+def _eye(
+    view: View,
+    points: NDArray[np.float32],
+    radii: Sequence[float],
+    known: Sequence[Cylinder],
+    lines: dict[tuple[int, int], FloatArray],
+) -> _Eye | None:
     pixel, depth = _seen_points(view, points)
     if len(depth) < 100:
         return None
     near, middle, far = np.percentile(depth[:: max(len(depth) // 5000, 1)], [1, 50, 99])
     scale = min(1.0, ENOUGH * middle / (min(radii) * view.camera.fx))
+    scale = 2.0 ** (round(4.0 * np.log2(scale)) / 4.0)  # few sizes, so that edges found before serve again
     if scale < 1.0:
         width, height = (max(round(scale * side), 1) for side in (view.camera.width, view.camera.height))
         image = np.asarray(cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -139,7 +153,10 @@ def _eye(view: View, points: NDArray[np.float32], radii: Sequence[float], known:
         pixel = (pixel + 0.5) * scale - 0.5
     focal = view.camera.fx
     narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
-    found = ribbons(straight_edges(view.image), max(narrowest, 2.0), widest)
+    key = (view.stamp, view.camera.width)
+    if key not in lines:
+        lines[key] = straight_edges(view.image)
+    found = ribbons(lines[key], max(narrowest, 2.0), widest)
     within = np.zeros(len(found), bool)
     for cylinder in known:
         within |= _covered(found, cylinder, view)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +13,10 @@ from pipeprog_detect.bill import Bill
 from pipeprog_detect.classify import ClassProgress, progress
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.pipe import Cloud, Pipe, View
+from pipeprog_detect.identity import Identities
+from pipeprog_detect.keyframes import Keyframes
+from pipeprog_detect.memory import Memory
+from pipeprog_detect.pipe import Cloud, Pipe
 
 
 @dataclass(frozen=True)
@@ -48,28 +50,21 @@ class PipesReady:
 
 def serve(connection: Connection, config: DetectConfig, bill: Bill) -> None:
     """Works off commands from `connection` until it closes; of the maps that wait, only the newest counts."""
-    keyframes: dict[int, Keyframe] = {}
+    keyframes, identities, memory = Keyframes(), Identities(), Memory()
     while True:
         newest: Map | None = None
         while newest is None or connection.poll():
             command = connection.recv()
             if isinstance(command, Keyframe):
-                keyframes[command.stamp] = command
+                keyframes.add(command.stamp, command.encoded, command.camera)
             else:
                 newest = command
         cloud = Cloud(newest.points.astype(float), None if newest.normals is None else newest.normals.astype(float))
         views = [
-            _view(keyframes[stamp], pose)
+            keyframes.view(stamp, pose)
             for stamp, pose in zip(newest.stamps.tolist(), newest.map_from_camera, strict=True)
             if stamp in keyframes
         ]
-        pipes = detect(cloud, bill, config, views)
+        memory.next_map()
+        pipes = identities.named(detect(cloud, bill, config, views, memory=memory))
         connection.send(PipesReady(newest.revision, pipes, progress(pipes, bill)))
-
-
-def _view(keyframe: Keyframe, map_from_camera: NDArray[np.float64]) -> View:
-    image = cv2.imdecode(np.frombuffer(keyframe.encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise RuntimeError(f"keyframe {keyframe.stamp} has a pose but cannot be decoded")
-    camera_from_map = np.linalg.inv(map_from_camera).astype(float)
-    return View(keyframe.stamp, keyframe.camera.undistort_image(image), keyframe.camera.pinhole(), camera_from_map)

@@ -1,0 +1,34 @@
+"""A pipe of which a piece is known is followed in the images to its ends, and no farther."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeprog_detect.config import ContourConfig
+from pipeprog_detect.contour import refine
+from pipeprog_detect.growth import grown
+from pipeprog_detect.pipe import Cylinder, View
+
+# The pipe of `pipe_views`.
+PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
+END_TOLERANCE = 2e-3  # half a pixel
+
+
+@pytest.mark.parametrize("piece", [(0.0, 0.16), (0.12, 0.28), (0.24, 0.4)])
+def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[float, float]) -> None:
+    low, high = (PIPE.start + place * PIPE.axis for place in piece)
+    fit = refine(Cylinder(low, high, PIPE.radius), 0.002, pipe_views, [], ContourConfig())
+    assert fit is not None
+    assert (fit.cylinder.start - PIPE.start) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
+    assert (fit.cylinder.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
+    assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=0.5e-3)
+    short = refine(Cylinder(low, high, PIPE.radius), 0.002, pipe_views, [], ContourConfig(), follow=False)
+    assert short is not None
+    assert short.cylinder.length < 0.2
+
+
+def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[View], empty_views: list[View]) -> None:
+    for views in (pipe_views, empty_views):
+        same = grown(PIPE, 0.9, views, [], np.zeros(len(views)), 0.5)
+        assert same.length == pytest.approx(PIPE.length, abs=1e-9)
