@@ -17,6 +17,7 @@ from rich.progress import track
 
 from sitegen.field import build_field
 from sitegen.lab import build_lab
+from sitegen.motion import Robot, tell
 from sitegen.recording import (
     FIRST_STAMP,
     camera_info,
@@ -35,6 +36,7 @@ _FOCAL_OVER_WIDTH = 0.714  # 70 degrees across, a phone's main camera
 _SIZES = {"480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
 _PREVIEW_WIDTH = 320  # pixels across, enough for the thinnest pipe at two metres to be two wide
 _LAB_SECONDS = 16.0
+_MOTION_SEED = 1 << 20  # beyond the frames' seeds
 _SURFACE_VIEWS = 20  # about a million points
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -92,6 +94,8 @@ def make_site(
     distortion: Annotated[str, typer.Option(help="plumb_bob k1,k2,p1,p2,k3 of the lens")] = "0,0,0,0,0",
     hide_distortion: Annotated[bool, typer.Option(help="CameraInfo says there is no distortion")] = False,
     focal_error: Annotated[float, typer.Option(help="percent by which CameraInfo's focal length is off")] = 0.0,
+    robot: Annotated[bool, typer.Option(help="also what a robot tells: /odom, /imu and /tf_static")] = False,
+    odometry_error: Annotated[float, typer.Option(help="percent by which odometry's lengths are off")] = 0.0,
     surface: Annotated[bool, typer.Option(help="also NAME.surface.npz: true surface points and their pipes")] = False,
     allow_hidden: Annotated[bool, typer.Option(help="accept a recording that does not show every pipe")] = False,
     jobs: Annotated[int, typer.Option(help="frames rendered at a time", min=1)] = 1,
@@ -145,7 +149,10 @@ def make_site(
         points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
         np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
     # Last: where the recording is, all that belongs to it is there too.
-    write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown)
+    motion = tell(
+        walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, np.random.default_rng([seed, _MOTION_SEED])
+    )
+    write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown, motion if robot else ())
     console.print(f"{out}: {len(times)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
 
 

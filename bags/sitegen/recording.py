@@ -11,12 +11,13 @@ import numpy as np
 from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
+from sitegen.motion import CAMERA_FRAME, Told
 from sitegen.render import Lens
 from sitegen.site import BOARD_CENTRES, BOARD_CIRCLE_RADIUS, CLASSES, Site
 
 FloatArray = NDArray[np.float64]
 
-FRAME_ID = "camera_optical"
+FRAME_ID = CAMERA_FRAME
 FIRST_STAMP = 1_700_000_000_000_000_000
 _SECOND = 1_000_000_000
 
@@ -32,6 +33,31 @@ _INFO = (
     + f"{_RULE}MSG: sensor_msgs/RegionOfInterest\n"
     "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n"
 )
+
+
+_XYZ, _XYZW = "float64 x\nfloat64 y\nfloat64 z\n", "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
+_TRANSFORM = (
+    f"{_RULE}MSG: geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+    f"{_RULE}MSG: geometry_msgs/Vector3\n{_XYZ}{_RULE}MSG: geometry_msgs/Quaternion\n{_XYZW}"
+)
+_MOTION = {
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"
+    f"{_RULE}MSG: geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n"
+    f"geometry_msgs/Transform transform\n{_TRANSFORM}{_COMMON}",
+    "nav_msgs/msg/Odometry": "std_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"
+    f"{_RULE}MSG: geometry_msgs/PoseWithCovariance\ngeometry_msgs/Pose pose\nfloat64[36] covariance\n"
+    f"{_RULE}MSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+    f"{_RULE}MSG: geometry_msgs/TwistWithCovariance\ngeometry_msgs/Twist twist\nfloat64[36] covariance\n"
+    f"{_RULE}MSG: geometry_msgs/Twist\ngeometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n"
+    f"{_RULE}MSG: geometry_msgs/Point\n{_XYZ}{_RULE}MSG: geometry_msgs/Vector3\n{_XYZ}"
+    f"{_RULE}MSG: geometry_msgs/Quaternion\n{_XYZW}{_COMMON}",
+    "sensor_msgs/msg/Imu": "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\n"
+    "float64[9] orientation_covariance\ngeometry_msgs/Vector3 angular_velocity\n"
+    "float64[9] angular_velocity_covariance\ngeometry_msgs/Vector3 linear_acceleration\n"
+    "float64[9] linear_acceleration_covariance\n"
+    f"{_RULE}MSG: geometry_msgs/Quaternion\n{_XYZW}{_RULE}MSG: geometry_msgs/Vector3\n{_XYZ}{_COMMON}",
+}
 
 
 def camera_info(lens: Lens, focal_error: float, leave_out_distortion: bool) -> dict[str, Any]:
@@ -51,18 +77,32 @@ def camera_info(lens: Lens, focal_error: float, leave_out_distortion: bool) -> d
     }
 
 
-def write_bag(path: Path, info: dict[str, Any], frames: Iterable[tuple[int, bytes]]) -> None:
-    """Write (stamp in ns, JPEG bytes) with one CameraInfo each, at equal stamps; a file under its name is complete."""
+def write_bag(
+    path: Path, info: dict[str, Any], frames: Iterable[tuple[int, bytes]], motion: Iterable[Told] = ()
+) -> None:
+    """Write (stamp in ns, JPEG bytes) with one CameraInfo each, at equal stamps; a file under its name is complete.
+
+    `motion` is what a robot told, in order of time.
+    """
     part = path.with_name(path.name + ".part")
     with part.open("wb") as stream, Writer(stream) as writer:
         image_schema = writer.register_msgdef("sensor_msgs/msg/CompressedImage", _IMAGE)
         info_schema = writer.register_msgdef("sensor_msgs/msg/CameraInfo", _INFO)
+        schemas = {name: writer.register_msgdef(name, text) for name, text in _MOTION.items()}
+        waiting = iter(motion)
+        told = next(waiting, None)
         for sequence, (stamp, data) in enumerate(frames):
+            while told is not None and told.stamp <= stamp:
+                writer.write_message(told.topic, schemas[told.type_name], told.message, told.stamp, told.stamp)
+                told = next(waiting, None)
             header = {"stamp": {"sec": stamp // _SECOND, "nanosec": stamp % _SECOND}, "frame_id": FRAME_ID}
             times = {"log_time": stamp, "publish_time": stamp, "sequence": sequence}
             writer.write_message("/camera/camera_info", info_schema, {"header": header, **info}, **times)
             image = {"header": header, "format": "jpeg", "data": data}
             writer.write_message("/camera/image/compressed", image_schema, image, **times)
+        while told is not None:
+            writer.write_message(told.topic, schemas[told.type_name], told.message, told.stamp, told.stamp)
+            told = next(waiting, None)
     part.replace(path)
 
 

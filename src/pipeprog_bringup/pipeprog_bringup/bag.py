@@ -16,6 +16,7 @@ from pipeprog_camera.errors import InputError
 
 _IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
 # Depth and disparity images travel as the same message types; no camera's picture has these encodings.
+TF, TF_STATIC = "/tf", "/tf_static"
 _DEPTH_ENCODINGS = ("16UC1", "32FC1", "32FC2")
 
 
@@ -30,6 +31,15 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """One message of a robot's motion: the topic of pipeprog's graph that it belongs on, its type, its CDR bytes."""
+
+    topic: str
+    type_name: str
+    data: bytes
+
+
+@dataclass(frozen=True)
 class Bag:
     """One camera of a recording; iterate it for its frames in the order in which they were recorded."""
 
@@ -39,11 +49,21 @@ class Bag:
     camera_info_topic: str
     image_count: int
     camera: Camera
+    motion_topics: dict[str, str]  # of the recording -> of the graph
+    notes: list[str]  # what a person should know of the choice of topics
+    _motion_types: dict[str, str]
     _files: tuple[McapFile, ...]
     _first_info: bytes
 
     @classmethod
-    def open(cls, path: Path, image_topic: str | None = None, camera_info_topic: str | None = None) -> Bag:
+    def open(
+        cls,
+        path: Path,
+        image_topic: str | None = None,
+        camera_info_topic: str | None = None,
+        odometry_topic: str | None = None,
+        imu_topic: str | None = None,
+    ) -> Bag:
         """Find the camera of the recording `path` and check that its images and its calibration fit.
 
         Topics that are not given are found by their types. Raises InputError where the recording cannot be read, holds
@@ -54,15 +74,43 @@ class Bag:
         image_topic, info_topic = _choose(path, files, counts, types, image_topic, camera_info_topic)
         infos = (message.data for message in _messages(files, {info_topic}))
         first_info, camera = _first_camera(path, info_topic, infos)
-        bag = cls(path, image_topic, types[image_topic], info_topic, counts[image_topic], camera, files, first_info)
+        motion, notes = _choose_motion(path, types, odometry_topic, imu_topic)
+        motion_types = {topic: types[topic] for topic in motion}
+        bag = cls(
+            path,
+            image_topic,
+            types[image_topic],
+            info_topic,
+            counts[image_topic],
+            camera,
+            motion,
+            notes,
+            motion_types,
+            files,
+            first_info,
+        )
         bag._check_size()
         return bag
 
     def __iter__(self) -> Iterator[Frame]:
         """Stream the images; each carries the CameraInfo last recorded for its frame (the first one, before any)."""
+        return (message for message in self._stream(set()) if isinstance(message, Frame))
+
+    def with_motion(self) -> Iterator[Frame | Motion]:
+        """Stream the images and what odometry, TF and IMU tell between them; static transforms come first."""
+        for topic in sorted(self.motion_topics):
+            if self.motion_topics[topic] == TF_STATIC:
+                for message in _messages(self._files, {topic}):
+                    yield Motion(TF_STATIC, self._motion_types[topic], message.data)
+        yield from self._stream({topic for topic, target in self.motion_topics.items() if target != TF_STATIC})
+
+    def _stream(self, motion: set[str]) -> Iterator[Frame | Motion]:
         latest: dict[str, bytes] = {}
         newest = self._first_info
-        for topic, message in _tagged(self._files, {self.image_topic, self.camera_info_topic}):
+        for topic, message in _tagged(self._files, {self.image_topic, self.camera_info_topic, *motion}):
+            if topic in motion:
+                yield Motion(self.motion_topics[topic], self._motion_types[topic], message.data)
+                continue
             try:
                 stamp, frame_id = cdr.read_header(message.data)
                 if topic == self.camera_info_topic:
@@ -194,6 +242,31 @@ def _choose(
         for info in ([_sibling_info(camera)] if _sibling_info(camera) in infos else infos)
     ]
     raise InputError(f"{path} holds several cameras: choose one with\n" + "\n".join(choices))
+
+
+def _choose_motion(
+    path: Path, types: dict[str, str], odometry_topic: str | None, imu_topic: str | None
+) -> tuple[dict[str, str], list[str]]:
+    """Topics of a robot's motion and where in the graph they belong; notes where none of several is used."""
+    chosen = {topic: TF_STATIC if topic.endswith("static") else TF for topic, name in types.items() if name == cdr.TF}
+    notes = []
+    for flag, wanted, target, type_name in (
+        ("--odometry-topic", odometry_topic, "odometry", cdr.ODOMETRY),
+        ("--imu-topic", imu_topic, "imu", cdr.IMU),
+    ):
+        known = sorted(topic for topic, name in types.items() if name == type_name)
+        if wanted is not None and wanted not in known:
+            raise InputError(
+                f"{path}: {flag} {wanted} is not among its topics: {', '.join(known) or 'none of that type'}"
+            )
+        if wanted is not None or len(known) == 1:
+            chosen[wanted or known[0]] = target
+        elif known:
+            notes.append(
+                f"{path} holds several topics of {type_name}, and none is used: choose one with "
+                + " or ".join(f"{flag} {topic}" for topic in known)
+            )
+    return chosen, notes
 
 
 def _sibling_info(image_topic: str) -> str:

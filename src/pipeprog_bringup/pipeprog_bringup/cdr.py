@@ -16,6 +16,9 @@ from pipeprog_camera.camera import Camera
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
+TF = "tf2_msgs/msg/TFMessage"
 NANOSECONDS = 1_000_000_000
 
 

@@ -57,13 +57,27 @@ def replay(
     force: Force = False,
     image_topic: Annotated[str | None, typer.Option(help="Which camera, where there are several.")] = None,
     camera_info_topic: Annotated[str | None, typer.Option(help="Its calibration.")] = None,
+    odometry_topic: Annotated[str | None, typer.Option(help="Which odometry, where there are several.")] = None,
+    imu_topic: Annotated[str | None, typer.Option(help="Which IMU, where there are several.")] = None,
 ) -> None:
     """Run the node graph on a recording: keyframes, metric map, classified pipes, progress."""
     from pipeprog_bringup.console import print_progress, replay_bars
     from pipeprog_bringup.replay import Request
     from pipeprog_bringup.replay import replay as run
 
-    request = Request(bag, boq, out, board, rate, overrides or (), force, image_topic, camera_info_topic)
+    request = Request(
+        bag,
+        boq,
+        out,
+        board,
+        rate,
+        overrides or (),
+        force,
+        image_topic,
+        camera_info_topic,
+        odometry_topic,
+        imu_topic,
+    )
     with replay_bars() as report:
         outcome = run(request, report)
     for loss in outcome.losses:

@@ -175,13 +175,14 @@ class McapFile:
         try:
             if opcode == SCHEMA:
                 schema_id, name_length = struct.unpack_from("<HI", data)
-                self._schemas[schema_id] = data[6 : 6 + name_length].decode()
+                self._schemas.setdefault(schema_id, data[6 : 6 + name_length].decode())
             else:
                 channel_id, schema_id, topic_length = struct.unpack_from("<HHI", data)
                 topic = data[8 : 8 + topic_length].decode()
                 (encoding_length,) = struct.unpack_from("<I", data, 8 + topic_length)
                 encoding = data[12 + topic_length : 12 + topic_length + encoding_length].decode()
-                self.channels[channel_id] = Channel(topic, self._schemas.get(schema_id, ""), encoding)
+                # The summary says again what is known already, and it is what a tear damages first.
+                self.channels.setdefault(channel_id, Channel(topic, self._schemas.get(schema_id, ""), encoding))
         except (struct.error, UnicodeDecodeError):
             return
 

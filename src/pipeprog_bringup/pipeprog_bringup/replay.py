@@ -15,16 +15,18 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 from pipeprog_bringup import cdr, results
-from pipeprog_bringup.bag import Bag, Frame
+from pipeprog_bringup.bag import TF, TF_STATIC, Bag, Frame, Motion
 from pipeprog_bringup.bag_writer import BagWriter
 from pipeprog_bringup.cloud_io import write_ply
 from pipeprog_bringup.frame_log import FrameLog
@@ -49,6 +51,9 @@ _MOVING = ("choosing keyframes", "working off the last keyframes")  # stages in 
 DELIVERY_SECONDS = 60.0  # for the last messages, once the node has said that they are published
 
 IMAGE_TYPES = {cdr.COMPRESSED_IMAGE: (CompressedImage, "image/compressed"), cdr.IMAGE: (Image, "image")}
+MOTION_TYPES = {"odometry": Odometry, "imu": Imu, TF: TFMessage, TF_STATIC: TFMessage}
+KEPT = 1000  # messages of motion, more than are ever on their way
+MOTION_IN_FLIGHT = 100  # messages of motion between two waits for the SfM to have them
 # Subscribers of each topic within the graph, the command itself included, before the first image is worth sending.
 _SUBSCRIBERS = {
     "keyframes/image/compressed": 2,
@@ -74,6 +79,8 @@ class Request:
     force: bool = False
     image_topic: str | None = None
     camera_info_topic: str | None = None
+    odometry_topic: str | None = None
+    imu_topic: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +122,9 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     Raises InputError for what the user can mend and NodeFailure when a node dies, hangs or fails; either leaves no
     process and no file behind.
     """
-    bag = Bag.open(request.bag, request.image_topic, request.camera_info_topic)
+    bag = Bag.open(
+        request.bag, request.image_topic, request.camera_info_topic, request.odometry_topic, request.imu_topic
+    )
     bill = load_bill(request.boq)
     boards = load_boards(request.board) if request.board else []
     if request.rate is not None and not request.rate > 0:
@@ -125,6 +134,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     configs = effective(request.overrides)
     configs["frames"] = dataclasses.replace(configs["frames"], lockstep=True)
     parameters = as_parameters(configs)
+    parameters["sfm"]["lockstep"] = True
     parameters["sfm"]["board"] = str(request.board.resolve()) if request.board else ""
     parameters["detect"] |= {"boq": str(request.boq.resolve()), "intermediate": False}
     with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
@@ -149,6 +159,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
                     "bag": str(request.bag),
                     "image_topic": bag.image_topic,
                     "camera_info_topic": bag.camera_info_topic,
+                    "motion_topics": bag.motion_topics,
                     "rate": request.rate,
                 },
             },
@@ -183,6 +194,7 @@ class _Run:
         self._latest: dict[type, Any] = {}
         self._moved = time.monotonic()
         self._answered = 0
+        self._motion_sent = self._motion_heard = 0
 
     def through(self, graph: Graph) -> tuple[_Survey, msg.SfmStatus]:
         """Play every frame, let each node finish, and collect the last messages."""
@@ -204,6 +216,11 @@ class _Run:
                     lambda: f"frames decided on {self.log.considered} of {played} images",
                 )
             with self._timed("sfm", "reconstructing"):
+                self._wait_until(
+                    lambda: self._motion_heard >= self._motion_sent,
+                    DELIVERY_SECONDS,
+                    lambda: f"sfm has heard {self._motion_heard} of {self._motion_sent} messages of motion",
+                )
                 revision = self._finish("sfm", keyframes)
             if not revision:
                 raise InputError(self._status.message or "nothing was reconstructed: no map came from sfm")
@@ -222,6 +239,11 @@ class _Run:
         image_type, image_topic = IMAGE_TYPES[self._bag.image_type]
         self._images = node.create_publisher(image_type, image_topic, qos.reliable(4 * IN_FLIGHT))
         self._infos = node.create_publisher(CameraInfo, "camera_info", qos.reliable(4 * IN_FLIGHT))
+        self._motion = {
+            topic: node.create_publisher(kind, topic, qos.kept(KEPT) if topic == TF_STATIC else qos.reliable(KEPT))
+            for topic, kind in MOTION_TYPES.items()
+            if topic in self._bag.motion_topics.values()
+        }
         node.create_subscription(msg.FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
         node.create_subscription(msg.ImageOverlapArray, "image_overlap", self._on_overlap, qos.kept(1000))
         node.create_subscription(msg.SfmStatus, "sfm_status", self._on_status, qos.latched())
@@ -237,6 +259,7 @@ class _Run:
         missing = [topic for topic, count in _SUBSCRIBERS.items() if self._node.count_subscribers(topic) < count]
         missing += [name for name, service in self._services.items() if not service.service_is_ready()]
         missing += ["image"] * (not self._images.get_subscription_count())
+        missing += [topic for topic, publisher in self._motion.items() if not publisher.get_subscription_count()]
         missing += ["camera_info"] * (not self._infos.get_subscription_count())
         missing += [
             topic
@@ -249,7 +272,10 @@ class _Run:
         """Send every frame, never more than IN_FLIGHT ahead of the selector; returns how many were sent."""
         played = 0
         begun, first = time.monotonic(), None
-        for frame in self._bag:
+        for frame in self._bag.with_motion():
+            if isinstance(frame, Motion):
+                self._move(frame)
+                continue
             first = frame.stamp if first is None else first
             if not cdr.is_whole(frame.data, self._bag.image_type):
                 self.log.skip(frame.stamp, "damaged message")
@@ -272,6 +298,19 @@ class _Run:
         self.log.play(frame.stamp)
         self._infos.publish(_info(frame))
         self._images.publish(frame.data)
+
+    def _move(self, message: Motion) -> None:
+        """Pass on what a robot told of its motion; a damaged message tells nothing."""
+        publisher = self._motion[message.topic]
+        try:
+            told = deserialize_message(message.data, publisher.msg_type)
+        except Exception:  # rclpy raises whatever its type support makes of the bytes
+            return
+        publisher.publish(told)
+        # A message of TF counts for each of its transforms.
+        self._motion_sent += len(told.transforms) if hasattr(told, "transforms") else 1
+        if self._motion_sent % MOTION_IN_FLIGHT == 0:
+            publisher.wait_for_all_acked()
 
     def _finish(self, name: str, expected: int) -> int:
         """Let a node finish after `expected` inputs; returns how many outputs it has published."""
@@ -371,7 +410,11 @@ class _Run:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self._heard[status.name.partition(":")[0]] = time.monotonic()
+            name = status.name.partition(":")[0]
+            self._heard[name] = time.monotonic()
+            if name == "sfm":
+                values = {value.key: value.value for value in status.values}
+                self._motion_heard = int(values.get("motion", 0))
 
 
 _LATCHED = {

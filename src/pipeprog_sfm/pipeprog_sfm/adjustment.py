@@ -117,8 +117,10 @@ def function_covariance(
     error = _residuals(rotation, translation, points, start, view, rays, focal)
     square = (error**2).sum(axis=1)
     weight = 1.0 / (1.0 + square / loss_scale**2)
-    scores = np.empty((len(gradients), len(points)))
+    scores = np.zeros((len(gradients), len(points)))
     for number, gradient in enumerate(gradients):
+        if not gradient.any():
+            continue
         poses = _solve(blocks, row, column, gradient[:-1]).reshape(-1, 6)
         moves = _back_substitute(poses, np.zeros_like(gp), w, v_inverse, start, view, index)
         size = DIFFERENCE / max(float(np.abs(poses).max() * focal.max()), 1e-300)

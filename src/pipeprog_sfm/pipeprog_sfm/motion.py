@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,23 +63,19 @@ class TransformTree:
 
     def __init__(self) -> None:
         self._static: dict[str, Transform] = {}
-        self._moving: dict[str, list[tuple[int, int, Transform]]] = {}
-        self._count = 0
+        self._moving: dict[str, dict[str, list[Transform]]] = {}
 
     def __bool__(self) -> bool:
         return bool(self._moving)
 
     def add(self, transforms: Iterable[Transform]) -> None:
-        """Takes transforms in any order; a child keeps the parent that it came with first."""
+        """Takes transforms in any order; what they come to does not depend on it."""
         for transform in transforms:
-            known = self._edge(transform.child)
-            if transform.child == transform.parent or (known is not None and known.parent != transform.parent):
-                continue
             if transform.static:
                 self._static[transform.child] = transform
-            elif transform.child not in self._static:
-                self._count += 1
-                insort(self._moving.setdefault(transform.child, []), (transform.stamp, self._count, transform))
+            else:
+                samples = self._moving.setdefault(transform.child, {}).setdefault(transform.parent, [])
+                insort(samples, transform, key=lambda one: (one.stamp, one.parent_from_child.tobytes()))
 
     def path(self, camera: str, stamps: Sequence[int]) -> Path:
         """Poses of the frame `camera` in the frame at the root of its tree, at those stamps [ns] that are covered.
@@ -89,11 +86,11 @@ class TransformTree:
             NoPathError: nothing above the camera moves.
         """
         chain = [camera]
-        while (edge := self._edge(chain[-1])) is not None and edge.parent not in chain:
-            chain.append(edge.parent)
-            if edge.parent.rpartition("/")[2] == ODOMETRY_FRAME:
+        while (parent := self._parent(chain[-1])) and parent not in chain:
+            chain.append(parent)
+            if parent.rpartition("/")[2] == ODOMETRY_FRAME:
                 break
-        if not any(child in self._moving for child in chain[:-1]):
+        if all(child in self._static for child in chain[:-1]):
             moving = ", ".join(sorted(self._moving))
             raise NoPathError(
                 f"odometry moves {moving}, and no transform leads from there to the camera's frame '{camera}'"
@@ -103,11 +100,11 @@ class TransformTree:
         times = np.asarray(stamps, np.int64)
         covered: NDArray[np.bool_] = np.ones(len(times), bool)
         poses = np.tile(np.eye(4), (len(times), 1, 1))
-        for child in chain[:-1]:
+        for child, parent in pairwise(chain):
             if child in self._static:
                 poses = self._static[child].parent_from_child @ poses
             else:
-                found, known = _interpolated([entry[2] for entry in self._moving[child]], times)
+                found, known = _interpolated(self._moving[child][parent], times)
                 poses, covered = found @ poses, covered & known
         return Path(chain[-1], times[covered], poses[covered])
 
@@ -131,10 +128,12 @@ class TransformTree:
             passed.add(frame)
         return (np.linalg.inv(above[frame]) @ pose)[:3, :3]
 
-    def _edge(self, child: str) -> Transform | None:
+    def _parent(self, child: str) -> str:
+        """The frame above, "" at the root; of several the one that was told most often."""
         if child in self._static:
-            return self._static[child]
-        return self._moving[child][0][2] if child in self._moving else None
+            return self._static[child].parent
+        parents = self._moving.get(child, {})
+        return max(sorted(parents), key=lambda parent: len(parents[parent]), default="")
 
 
 def _interpolated(samples: Sequence[Transform], times: NDArray[np.int64]) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -150,7 +150,7 @@ def combine(
     weights /= weights.sum()
     log_scale = float(weights @ logs)
     sigma = float(np.sqrt(weights @ joint @ weights))
-    if sigma > LARGEST_SIGMA:
+    if not sigma <= LARGEST_SIGMA:
         raise NoScaleError(
             "too_uncertain",
             f"the scale is known to {100 * sigma:.1f} % only: film the board from more sides, or measure a distance",
