@@ -63,10 +63,8 @@ class WorkerProcess:
     def close(self) -> None:
         """Ends the child, now: what it has not finished is lost."""
         self._closing = True
-        self._process.terminate()
+        self._process.kill()  # rather than SIGTERM, at which some libraries print a stack trace
         self._process.join(timeout=2.0)
-        if self._process.is_alive():
-            self._process.kill()
 
     def _write(self) -> None:
         while not self._closing:

@@ -225,6 +225,23 @@ class Mapper:
         own = model.point_of[model.features(model.stamps.index(stamp))]
         return model.points[own[own >= 0]]
 
+    def observations(self) -> tuple[FloatArray, dict[int, tuple[IntArray, FloatArray]]]:
+        """(P, 3) points of the published model, and what each keyframe sees of them.
+
+        By stamp: (K,) rows of the points and (K, 2) pixels of the ideal pinhole image.
+        """
+        model = self._published
+        ids = np.unique(model.point_of[model.point_of >= 0])
+        row = np.full(len(model.points), -1)
+        row[ids] = np.arange(len(ids))
+        seen = {}
+        for view in np.argsort(model.stamps, kind="stable"):
+            stamp = model.stamps[view]
+            own = model.point_of[model.features(view)]
+            pixels = self._keyframes[stamp].features.keypoints[own >= 0].astype(np.float64)
+            seen[stamp] = row[own[own >= 0]], pixels
+        return model.points[ids], seen
+
     def ties(self) -> list[FrameTie]:
         """Overlap of the keyframes for which it changed since the last call."""
         model = self._published if self._models else SparseModel()

@@ -28,14 +28,14 @@ from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.board import load_boards, load_distances
 from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.journal import Journal, Record
 from pipeprog_sfm.mapper import FrameTie
 from pipeprog_sfm.motion import Acceleration, Motion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
 from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Ready, Retire, Retired, serve
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
-
-
+MAX_VAIN_STARTS = 2  # of the worker that end before it has answered anything
 MAX_MOTION = 1000  # samples of odometry, TF or IMU that wait for this process: seconds of the fastest
 
 
@@ -44,11 +44,18 @@ class SfmNode(Node):
 
     def __init__(self) -> None:
         super().__init__("sfm")
-        config = declare(self, SfmConfig, extra=("board", "lockstep"))
+        config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep"))
         board = str(self.declare_parameter("board", "").value)
         boards = load_boards(board) if board else []
         distances = load_distances(board, boards) if board else []
-        self._worker = WorkerProcess(self, serve, (config, boards, distances), self._on_event, self._on_death)
+        self._colmap = str(self.declare_parameter("colmap", "").value)
+        lockstep = bool(self.declare_parameter("lockstep", False).value)
+        # A replay that loses its reconstruction ends; on the robot it is begun anew.
+        self._journal = None if lockstep else Journal()
+        self._answered = 0  # commands of the journal
+        self._vain_starts = 0
+        self._arguments = config, boards, distances
+        self._worker = self._start_worker()
         self._images: dict[int, CompressedImage] = {}
         self._cameras: dict[int, tuple[str, Camera]] = {}
         self._frame_ids: dict[int, str] = {}
@@ -75,7 +82,6 @@ class SfmNode(Node):
         self.create_subscription(CameraInfo, "keyframes/camera_info", self._on_camera_info, qos.reliable(MAX_BACKLOG))
         self.create_subscription(msg.KeyframesRetired, "keyframes/retired", self._on_retired, qos.reliable(MAX_BACKLOG))
         # Live, drivers send best effort and a lost sample is none too many; a recording must lose none.
-        lockstep = bool(self.declare_parameter("lockstep", False).value)
         source = qos.reliable(MAX_MOTION) if lockstep else qos.sensor(MAX_MOTION)
         subscribe = partial(self.create_subscription, qos_overriding_options=qos.OVERRIDABLE)
         subscribe(Odometry, "odometry", self._on_odometry, source)
@@ -89,6 +95,8 @@ class SfmNode(Node):
     def destroy_node(self) -> None:
         """Ends the worker with the node."""
         self._worker.close()
+        if self._journal is not None:
+            self._journal.close()
         super().destroy_node()
 
     def _on_image(self, message: CompressedImage) -> None:
@@ -115,7 +123,7 @@ class SfmNode(Node):
         if self._worker.backlog >= MAX_BACKLOG:
             self._dropped += 1
         else:
-            self._worker.send(Keyframe(stamp, bytes(image.data), camera, frame_id, self._take_motion()))
+            self._send(Keyframe(stamp, bytes(image.data), camera, frame_id, self._take_motion()))
         self._retire_when_due()
         self._finish_when_complete()
 
@@ -166,7 +174,7 @@ class SfmNode(Node):
         while self._retirements and self._seen >= self._retirements[0].keyframes_published:
             message = self._retirements.popleft()
             self._retiring.append(message)
-            self._worker.send(Retire(tuple(messages.stamp_ns(stamp) for stamp in message.stamps)))
+            self._send(Retire(tuple(messages.stamp_ns(stamp) for stamp in message.stamps)))
 
     async def _on_finish(self, request: srv.Finish.Request, response: srv.Finish.Response) -> srv.Finish.Response:
         done: Future = Future()
@@ -182,13 +190,15 @@ class SfmNode(Node):
     def _finish_when_complete(self) -> None:
         if self._finish is not None and not self._finish_sent and self._seen >= self._finish[0]:
             self._finish_sent = True
-            self._worker.send(Finish(self._take_motion()))
+            self._worker.send(Finish(self._take_motion(), self._colmap))
 
     def _on_event(self, event: Ready | KeyframeDone | Retired | MapReady | Finished) -> None:
         if isinstance(event, Ready):
             self._ready = True
             return
         self._status = event.status
+        self._vain_starts = 0
+        self._answered += isinstance(event, KeyframeDone | Retired)
         if isinstance(event, KeyframeDone):
             self._done += 1
             self._publish_overlap(messages.header(event.stamp, self._frame_ids[event.stamp]), event.ties)
@@ -205,9 +215,32 @@ class SfmNode(Node):
             self._finish[1].set_result(event.problem)
             self._finish = None
 
+    def _start_worker(self) -> WorkerProcess:
+        done = Record("", ()) if self._journal is None else self._journal.record(0, self._answered)
+        return WorkerProcess(self, serve, (*self._arguments, done), self._on_event, self._on_death)
+
+    def _send(self, command: Keyframe | Retire) -> None:
+        if self._journal is not None:
+            self._journal.append(command)
+        self._worker.send(command)
+
     def _on_death(self, exit_code: int) -> None:
-        self.get_logger().fatal(f"the reconstruction process died (exit code {exit_code}): the map is lost")
-        raise SystemExit(1)
+        died = f"the reconstruction process died (exit code {exit_code})"
+        self._vain_starts += 1
+        if self._journal is None or self._vain_starts > MAX_VAIN_STARTS:
+            self.get_logger().fatal(f"{died}: the map is lost")
+            raise SystemExit(1)
+        self.get_logger().error(f"{died}: it is started again, and takes its {self._answered} keyframes again")
+        self._ready = False
+        suspect = next(iter(self._journal.record(self._answered, self._answered + 1)), None)
+        if isinstance(suspect, Keyframe):
+            self._journal.remove(self._answered)
+            self._dropped += 1
+        self._worker = self._start_worker()
+        for command in self._journal.record(self._answered, len(self._journal)):
+            self._worker.send(command)
+        if self._finish_sent:
+            self._worker.send(Finish(self._take_motion(), self._colmap))
 
     def _publish_overlap(self, header: Header, ties: list[FrameTie]) -> None:
         self._overlap.publish(

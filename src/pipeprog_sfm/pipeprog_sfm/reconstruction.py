@@ -6,6 +6,7 @@ from collections.abc import Collection, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_sfm.board import Board, Distance
 from pipeprog_sfm.board_tracker import BoardTracker
+from pipeprog_sfm.colmap import ModelView, write_model
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.dense import DenseMapper, EncodedImage, centre
 from pipeprog_sfm.fusion import FusedCloud
@@ -122,6 +124,17 @@ class Reconstruction:
         self._request(complete=True)
         return self._take()
 
+    def write_colmap(self, folder: Path) -> None:
+        """The sparse model in `map` for COLMAP, binary and as text; images are named by their stamps [ns]."""
+        scale, trajectory = self._metric()
+        points, seen = self._mapper.observations()
+        poses = dict(zip(trajectory.stamps.tolist(), np.linalg.inv(trajectory.map_from_camera), strict=True))
+        views = [
+            ModelView(f"{stamp}.jpg", self._images[stamp].camera, poses[stamp], pixels, rows)
+            for stamp, (rows, pixels) in seen.items()
+        ]
+        write_model(folder, views, points @ scale.map_from_model[:3, :3].T + scale.map_from_model[:3, 3])
+
     def ties(self) -> list[FrameTie]:
         """Overlap of the keyframes that changed since the last call (Eq. 1)."""
         return self._mapper.ties()
@@ -159,7 +172,7 @@ class Reconstruction:
         return self._pending is not None
 
     def finished_map(self) -> MetricMap | None:
-        """The map that was requested, once it is there."""
+        """The map that was requested, once it is there; raises NotMetricError when there is no surface in it yet."""
         return self._take() if self._pending is not None and self._pending[2].done() else None
 
     def _request(self, complete: bool) -> None:
@@ -172,7 +185,11 @@ class Reconstruction:
         assert self._pending is not None
         scale, trajectory, cloud = self._pending
         self._pending = None
-        return MetricMap(scale, trajectory, cloud.result())
+        points = cloud.result()
+        if not len(points.points):
+            self._reason = "no surface has been seen from enough sides: walk past it, sideways"
+            raise NotMetricError(self._reason)
+        return MetricMap(scale, trajectory, points)
 
     def _metric(self) -> tuple[ScaleEstimate, Trajectory]:
         """The scale, estimated again when the map has moved or a target was seen, and the metric poses."""

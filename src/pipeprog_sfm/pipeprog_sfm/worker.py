@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
@@ -41,9 +42,10 @@ class Retire:
 
 @dataclass(frozen=True)
 class Finish:
-    """Command: no more keyframes come; publish the final map."""
+    """Command: no more keyframes come; publish the final map, and write the sparse model where a folder is named."""
 
     motion: Motion = field(default_factory=Motion)
+    colmap: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,20 @@ class Finished:
     problem: str
 
 
-def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board], distances: Sequence[Distance]) -> None:
-    """Works off commands from `connection` until it closes."""
+def serve(
+    connection: Connection,
+    config: SfmConfig,
+    boards: Sequence[Board],
+    distances: Sequence[Distance],
+    answered: Iterable[Keyframe | Retire],
+) -> None:
+    """Works off commands from `connection` until it closes; those that a predecessor has answered come before."""
     warm_up(config)
-    connection.send(Ready())
     reconstruction = Reconstruction(config, boards, distances)
+    for command in answered:
+        _answer(reconstruction, command)
+        reconstruction.update_dense()
+    connection.send(Ready())
     since_map, idle_since = 0, time.monotonic()
     while True:
         busy = since_map > 0 or reconstruction.is_mapping
@@ -97,17 +108,17 @@ def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board], di
             command = connection.recv()
             if isinstance(command, Finish):
                 reconstruction.move(command.motion)
-                connection.send(_finish(connection, reconstruction))
+                connection.send(_finish(connection, reconstruction, command.colmap))
                 continue
+            connection.send(_answer(reconstruction, command))
             if isinstance(command, Keyframe):
-                connection.send(_add(reconstruction, command))
                 reconstruction.update_dense()  # once the pose is out
                 since_map += 1
-            else:
-                reconstruction.retire(command.stamps)
-                connection.send(Retired(reconstruction.status(), reconstruction.ties()))
             idle_since = time.monotonic()
-        metric_map = reconstruction.finished_map()
+        try:
+            metric_map = reconstruction.finished_map()
+        except NotMetricError:
+            metric_map, since_map = None, max(since_map, 1)
         if metric_map is not None:
             connection.send(MapReady(reconstruction.status(), metric_map))
         idle = since_map > 0 and time.monotonic() - idle_since > IDLE_SECONDS
@@ -115,6 +126,13 @@ def serve(connection: Connection, config: SfmConfig, boards: Sequence[Board], di
             since_map = 0
             with contextlib.suppress(NotMetricError):  # the status tells
                 reconstruction.request_map()
+
+
+def _answer(reconstruction: Reconstruction, command: Keyframe | Retire) -> KeyframeDone | Retired:
+    if isinstance(command, Keyframe):
+        return _add(reconstruction, command)
+    reconstruction.retire(command.stamps)
+    return Retired(reconstruction.status(), reconstruction.ties())
 
 
 def _add(reconstruction: Reconstruction, keyframe: Keyframe) -> KeyframeDone:
@@ -129,10 +147,12 @@ def _add(reconstruction: Reconstruction, keyframe: Keyframe) -> KeyframeDone:
     return KeyframeDone(keyframe.stamp, reconstruction.status(), reconstruction.ties(), trajectory)
 
 
-def _finish(connection: Connection, reconstruction: Reconstruction) -> Finished:
+def _finish(connection: Connection, reconstruction: Reconstruction, colmap: str) -> Finished:
     try:
         metric_map = reconstruction.finish()
     except NotMetricError as error:
         return Finished(reconstruction.status(), str(error))
     connection.send(MapReady(reconstruction.status(), metric_map))
+    if colmap:
+        reconstruction.write_colmap(Path(colmap))
     return Finished(reconstruction.status(), "")
