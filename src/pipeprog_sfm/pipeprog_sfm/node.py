@@ -28,7 +28,7 @@ from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.board import load_boards, load_distances
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.journal import Journal, Record
+from pipeprog_sfm.journal import Journal
 from pipeprog_sfm.mapper import FrameTie
 from pipeprog_sfm.motion import Acceleration, Motion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
@@ -216,7 +216,7 @@ class SfmNode(Node):
             self._finish = None
 
     def _start_worker(self) -> WorkerProcess:
-        done = Record("", ()) if self._journal is None else self._journal.record(0, self._answered)
+        done = () if self._journal is None else self._journal.record(0, self._answered)
         return WorkerProcess(self, serve, (*self._arguments, done), self._on_event, self._on_death)
 
     def _send(self, command: Keyframe | Retire) -> None:
