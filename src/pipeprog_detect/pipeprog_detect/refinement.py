@@ -26,8 +26,12 @@ SETTLED, MAX_ROUNDS = 0.1, 3
 FEW_VIEWS = 30
 # A planned size so near to a radius that is none is tried, and taken with so much of its outlines' support.
 NEAR_PLANNED, AS_GOOD = 0.15, 0.6
+# Cloud and outlines contradict each other where their radii differ by so many standard deviations, noise included.
+CONTRADICTION = 4.0
 # Lines are followed up for so many pipes at most, beside so many of the cloud's points.
 MOST_LOST, MOST_POINTS = 40, 600_000
+# Without points of the cloud the outlines must be the better seen.
+LINES_CONVINCING = 0.6
 # What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
 # Shorter than so many radii a pair of lines may be a hanger, a clamp, or chance.
@@ -87,18 +91,21 @@ class Jury:
         for number in order:
             candidate = candidates[number]
             others = [cylinder for other, cylinder in current.items() if other != number]
-            fit = self._as_planned(self._refined(candidate, others, self._views), others)
+            fit = self._refined(candidate, others, self._views)
             if fit is None and not (trusted[number] and (not self.sits or _resolved(candidate))):
                 continue
             # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate or a corner.
             doubtful = self.sits and (candidate.blurred or not trusted[number])
             if fit is not None and doubtful and not self._is_planned(fit):
                 continue
-            measured = (
-                Measured(candidate, candidate.cylinder, candidate.radius_sigma)
-                if fit is None
-                else Measured(candidate, fit.cylinder, fit.radius_sigma)
-            )
+            if not doubtful:
+                fit = self._as_planned(fit, others)
+            if fit is None:
+                measured = Measured(candidate, candidate.cylinder, candidate.radius_sigma)
+            elif _contradict(candidate, fit):
+                measured = Measured(candidate, *_by_the_cloud(candidate, fit))
+            else:
+                measured = Measured(candidate, fit.cylinder, fit.radius_sigma)
             middle = 0.5 * (measured.cylinder.start + measured.cylinder.end)
             if not any(_contains(known.cylinder, middle) for known in found):
                 current[number] = measured.cylinder
@@ -142,19 +149,24 @@ class Jury:
         for proposed in propose(self._views, some, thin, known, MOST_LOST, self._memory.edges):
             if _is_known(proposed, known):
                 continue
-            sigma = proposed.radius
-            fit = refine(
-                proposed, sigma, self._views, known, self._config, thin, known_radius=True, depth_sigma=LINE_DEPTH_SIGMA
-            )
-            if fit is None or fit.support < CONVINCING or not self._is_planned(fit) or _is_known(fit.cylinder, known):
-                continue
-            if fit.cylinder.length < SLENDER * fit.cylinder.radius:
-                continue
-            if fit.flatness - FLAT > SURELY * fit.flatness_sigma:
+            fit = self._by_lines(proposed, known, thin, follow=False)
+            if fit is not None:
+                fit = self._by_lines(replace(proposed, start=fit.cylinder.start, end=fit.cylinder.end), known, thin)
+            if fit is None or fit.cylinder.length < SLENDER * fit.cylinder.radius or _is_known(fit.cylinder, known):
                 continue
             lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma))
             known.append(fit.cylinder)
         return tuple(lost)
+
+    def _by_lines(
+        self, proposed: Cylinder, known: Sequence[Cylinder], radii: Sequence[float], follow: bool = True
+    ) -> ContourFit | None:
+        """The fit of a pipe proposed by its lines, where it has the outlines of one and a planned size."""
+        sigma, views = proposed.radius, self._views
+        fit = refine(proposed, sigma, views, known, self._config, radii, follow, True, LINE_DEPTH_SIGMA)
+        if fit is None or fit.support < LINES_CONVINCING or not self._is_planned(fit):
+            return None
+        return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
 
     def _is_planned(self, fit: ContourFit) -> bool:
         return classify(fit.cylinder.radius, fit.radius_sigma, self._bill).probability > 0.0
@@ -222,6 +234,23 @@ def _alike(one: Cylinder, other: Cylinder) -> bool:
     same = max(np.linalg.norm(one.start - other.start), np.linalg.norm(one.end - other.end))
     turned = max(np.linalg.norm(one.start - other.end), np.linalg.norm(one.end - other.start))
     return bool(min(same, turned) < max(tolerance, 0.1 * other.length))
+
+
+def _contradict(candidate: Candidate, fit: ContourFit) -> bool:
+    """Whether the outlines give a radius that a cloud which resolves the section cannot have.
+
+    Where the cameras never rise or fall, the edge of the light along a pipe passes for its outline.
+    """
+    sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, fit.radius_sigma])
+    return _resolved(candidate) and bool(abs(fit.cylinder.radius - candidate.cylinder.radius) > CONTRADICTION * sigma)
+
+
+def _by_the_cloud(candidate: Candidate, fit: ContourFit) -> tuple[Cylinder, float]:
+    """The cloud's cylinder between the ends that the keyframes show, and the standard deviation of its radius [m]."""
+    line = candidate.cylinder
+    low, high = sorted(float((end - line.start) @ line.axis) for end in (fit.cylinder.start, fit.cylinder.end))
+    cylinder = Cylinder(line.start + low * line.axis, line.start + high * line.axis, line.radius)
+    return cylinder, float(np.hypot(candidate.radius_sigma, candidate.evidence.noise))
 
 
 def _resolved(candidate: Candidate) -> bool:
