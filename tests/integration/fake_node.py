@@ -11,13 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pipeprog_msgs import msg, srv
@@ -36,7 +38,7 @@ class FakeNode(Node):
         self._inputs: list[int] = []
         self._outputs = 0
         self._finish: tuple[int, Future] | None = None
-        self._infos = 0
+        self._infos = self._moved = 0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(0.2, self._report)
         self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
@@ -46,7 +48,15 @@ class FakeNode(Node):
             Path(os.environ["FAKE_PIDS"]).write_text(f"{os.getpid()} {child.pid}")
 
     def _report(self) -> None:
-        self._diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(name=f"{self._role}: fake")]))
+        self._diagnostics.publish(
+            DiagnosticArray(
+                status=[
+                    DiagnosticStatus(
+                        name=f"{self._role}: fake", values=[KeyValue(key="motion", value=str(self._moved))]
+                    )
+                ]
+            )
+        )
 
     def _be_frames(self) -> None:
         self._decisions = self.create_publisher(msg.FrameDecision, "frame_decisions", qos.reliable(1000))
@@ -65,6 +75,13 @@ class FakeNode(Node):
         self._statuses = self.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
         self.create_subscription(CompressedImage, "keyframes/image/compressed", self._on_keyframe, qos.reliable(50))
         self.create_subscription(CameraInfo, "keyframes/camera_info", self._count_info, qos.reliable(50))
+
+        self.create_subscription(Odometry, "odometry", self._on_motion, qos.reliable(1000))
+        self.create_subscription(Imu, "imu", self._on_motion, qos.reliable(1000))
+        self.create_subscription(TFMessage, "/tf_static", self._on_motion, qos.kept(1000))
+
+    def _on_motion(self, message: Odometry | Imu | TFMessage) -> None:
+        self._moved += len(message.transforms) if isinstance(message, TFMessage) else 1
 
     def _be_detect(self) -> None:
         self._pipes = self.create_publisher(msg.PipeArray, "pipes", qos.latched())

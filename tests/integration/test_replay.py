@@ -14,8 +14,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
+from geometry_msgs.msg import TransformStamped
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from nav_msgs.msg import Odometry
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Imu
+from tf2_msgs.msg import TFMessage
 
 from pipeprog_bringup import cdr
 from pipeprog_bringup.bag_writer import BagWriter
@@ -43,8 +49,15 @@ def jpeg(number: int) -> bytes:
     return cv2.imencode(".jpg", pixels)[1].tobytes()
 
 
-def write_bag(path: Path, frames: int = 23, damaged: int | None = None) -> Path:
+def write_bag(path: Path, frames: int = 23, damaged: int | None = None, motion: int = 0) -> Path:
     with path.open("wb") as stream, BagWriter(stream) as writer:
+        for number in range(motion):
+            stamp = START + number * 10_000_000
+            writer.write("/odom", cdr.ODOMETRY, serialize_message(Odometry()), stamp)
+            writer.write("/imu", cdr.IMU, serialize_message(Imu())[: 40 if number == 7 else None], stamp)
+        if motion:
+            transforms = TFMessage(transforms=[TransformStamped(), TransformStamped()])
+            writer.write("/tf_static", cdr.TF, serialize_message(transforms), START)
         for number in range(frames):
             stamp = START + number * 100_000_000
             image = cdr.write_compressed_image(stamp, "camera", "jpeg", jpeg(number))
@@ -107,7 +120,7 @@ def test_every_frame_is_considered_and_the_results_are_written(tmp_path: Path) -
     out = tmp_path / "out"
     names = sorted(file.name for file in out.iterdir())
     assert names == [
-        *("cloud.ply", "config.yaml", "frames.csv", "out.mcap", "pipes.json", "progress.csv", "run.json"),
+        *("cloud.las", "cloud.ply", "config.yaml", "frames.csv", "out.mcap", "pipes.json", "progress.csv", "run.json"),
         "trajectory.tum",
     ]
     with (out / "frames.csv").open() as stream:
@@ -126,6 +139,16 @@ def test_every_frame_is_considered_and_the_results_are_written(tmp_path: Path) -
         topics = [message.channel.topic for message in decoded]
     assert topics.count("/keyframes/image/compressed") == topics.count("/keyframes/camera_info") == 5
     assert {"/map_points", "/pipes", "/pipe_markers", "/keyframe_poses", "/sfm_status"} < set(topics)
+
+
+def test_what_a_robot_tells_of_its_motion_reaches_the_sfm(tmp_path: Path) -> None:
+    """The replay ends well only when the SfM has heard every message."""
+    process = start(tmp_path, motion=150)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "several topics" not in errors
+    motion = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())["replay"]["motion_topics"]
+    assert motion == {"/odom": "odometry", "/imu": "imu", "/tf_static": "/tf_static"}
 
 
 @pytest.mark.parametrize("node", ["frames", "sfm", "detect"])

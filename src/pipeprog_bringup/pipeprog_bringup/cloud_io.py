@@ -17,6 +17,7 @@ FloatArray = NDArray[np.float64]
 
 # Coarser coordinates than this cannot hold a pipe of 8.6 mm radius.
 RESOLUTION = 0.005
+LAS_STEP = 1e-4  # m between the whole numbers that LAS keeps: a hundredth of the noise of a point
 _NORMALS = ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz")
 
 
@@ -70,6 +71,31 @@ def write_ply(
     with path.open("wb") as stream:
         stream.write("\n".join(header).encode() + b"\n")
         vertices.tofile(stream)
+
+
+def write_las(
+    path: Path,
+    points: NDArray[np.floating],
+    colors: NDArray[np.uint8] | None = None,
+    normals: NDArray[np.floating] | None = None,
+) -> None:
+    """LAS 1.4 of points (N, 3) [m] to the tenth of a millimetre, as `write_ply`; normals as extra dimensions."""
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=6 if colors is None else 7)
+    header.scales, header.offsets = np.full(3, LAS_STEP), np.zeros(3)
+    header.creation_date = None  # the same cloud, the same bytes
+    if normals is not None:
+        header.add_extra_dims([laspy.ExtraBytesParams(name, np.float32) for name in _NORMALS[0]])
+    las = laspy.LasData(header)
+    las.xyz = points
+    if colors is not None:
+        # 16 bits, of which 8-bit colours fill the range.
+        las.red, las.green, las.blue = (257 * colors.astype(np.uint16)).T
+    if normals is not None:
+        for name, values in zip(_NORMALS[0], normals.T, strict=True):
+            las[name] = values
+    las.write(path)
 
 
 def _cloud_file(path: Path, columns: dict[str, NDArray]) -> CloudFile:

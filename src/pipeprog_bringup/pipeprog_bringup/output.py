@@ -57,8 +57,12 @@ class OutputFolder:
         return self
 
     def file(self, name: str) -> Path:
-        """Where to write the file that will be `path`/`name`."""
+        """Where to write the file that will be `path`/`name`; the name may lead into a folder."""
         return self._stage / name
+
+    def names(self) -> list[str]:
+        """The files written so far, relative to the folder."""
+        return sorted(str(file.relative_to(self._stage)) for file in self._stage.rglob("*") if file.is_file())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -98,23 +102,29 @@ class OutputFolder:
 
     def _publish(self) -> None:
         """Move the new files to their names and remove those of the earlier run that have no successor."""
-        names = sorted(file.name for file in self._stage.iterdir())
+        names = self.names()
         for name in names:
             with (self._stage / name).open("rb") as stream:
                 os.fsync(stream.fileno())
         stale = set(self._earlier_files()) - set(names)
         for name in names:
+            (self.path / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(self._stage / name, self.path / name)
         for name in stale:
             (self.path / name).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                (self.path / name).parent.rmdir()  # a folder that is empty now
 
     def _earlier_files(self) -> list[str]:
         """The files that the run.json in the folder lists as its own."""
         try:
             names = json.loads((self.path / "run.json").read_text())["files"]
-            return [name for name in names if isinstance(name, str) and name == Path(name).name]
+            return [name for name in names if isinstance(name, str) and self._is_inside(name)]
         except (OSError, ValueError, KeyError, TypeError):
             return []
+
+    def _is_inside(self, name: str) -> bool:
+        return not Path(name).is_absolute() and ".." not in Path(name).parts
 
     def _discard(self, keep_folder: bool = False) -> None:
         if self._stage != self.path:

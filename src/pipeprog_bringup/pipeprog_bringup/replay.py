@@ -28,7 +28,7 @@ from visualization_msgs.msg import MarkerArray
 from pipeprog_bringup import cdr, results
 from pipeprog_bringup.bag import TF, TF_STATIC, Bag, Frame, Motion
 from pipeprog_bringup.bag_writer import BagWriter
-from pipeprog_bringup.cloud_io import write_ply
+from pipeprog_bringup.cloud_io import write_las, write_ply
 from pipeprog_bringup.frame_log import FrameLog
 from pipeprog_bringup.graph import NODE_MODULES, Graph, NodeFailure, private_domain
 from pipeprog_bringup.output import OutputFolder
@@ -138,6 +138,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     parameters["sfm"]["board"] = str(request.board.resolve()) if request.board else ""
     parameters["detect"] |= {"boq": str(request.boq.resolve()), "intermediate": False}
     with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
+        parameters["sfm"]["colmap"] = str(folder.file("colmap").resolve())
         run = _Run(bag, request, report)
         with private_domain(scratch), Graph(parameters, scratch, modules) as graph, _ros():
             survey, status = run.through(graph)
@@ -472,7 +473,9 @@ def write_survey(
     results.write_pipes(folder.file("pipes.json"), pipes, classes, scale)
     results.write_progress(folder.file("progress.csv"), pipes, classes)
     points, normals = messages.points_from_cloud(survey.cloud)
-    write_ply(folder.file("cloud.ply"), points, messages.colors_from_cloud(survey.cloud), normals)
+    colors = messages.colors_from_cloud(survey.cloud)
+    write_ply(folder.file("cloud.ply"), points, colors, normals)
+    write_las(folder.file("cloud.las"), points, colors, normals)
     poses = [pose.pose for pose in survey.poses.poses]
     results.write_trajectory(
         folder.file("trajectory.tum"),

@@ -126,7 +126,7 @@ def write_run(folder: OutputFolder, facts: dict[str, Any]) -> None:
     path = folder.file("run.json")
     versions = {"python": platform.python_version(), "pipeprog": package_version("pipeprog_bringup")}
     versions.update({name: package_version(name) for name in _PACKAGES})
-    names = sorted({*(file.name for file in path.parent.iterdir()), path.name})
+    names = sorted({*folder.names(), path.name})
     finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
     content = {**facts, "finished": finished, "versions": versions, "files": names}
     path.write_text(json.dumps(content, indent=1) + "\n")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 
-from pipeprog_bringup.cloud_io import read_cloud, write_ply
+from pipeprog_bringup.cloud_io import read_cloud, write_las, write_ply
 from pipeprog_camera.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -50,6 +50,21 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(file.cloud.normals, vectors, atol=1e-6)
     vertex = PlyData.read(str(tmp_path / "cloud.ply"))["vertex"]
     np.testing.assert_array_equal(np.stack([vertex[name] for name in ("red", "green", "blue")], 1), colors)
+
+
+def test_las_holds_points_normals_and_colours(tmp_path: Path) -> None:
+    vectors = normals(len(POINTS))
+    colors = RNG.integers(0, 256, (len(POINTS), 3), dtype=np.uint8)
+    write_las(tmp_path / "cloud.las", POINTS, colors, vectors)
+    file = read_cloud(tmp_path / "cloud.las")
+    np.testing.assert_allclose(file.cloud.points, POINTS, atol=0.5001e-4)
+    assert file.cloud.normals is not None
+    np.testing.assert_allclose(file.cloud.normals, vectors, atol=1e-6)
+    las = laspy.read(tmp_path / "cloud.las")
+    np.testing.assert_array_equal(np.stack([las.red, las.green, las.blue], 1) >> 8, colors)
+    assert np.max(las.red) <= 65535
+    write_las(tmp_path / "again.las", POINTS, colors, vectors)
+    assert (tmp_path / "again.las").read_bytes() == (tmp_path / "cloud.las").read_bytes()
 
 
 @pytest.mark.parametrize("encoding", list(Encoding))

@@ -46,6 +46,25 @@ def test_files_appear_when_the_run_has_ended(tmp_path: Path) -> None:
     assert names(folder) == ["pipes.json"]
 
 
+def test_files_in_folders_come_and_go_with_the_run(tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    with OutputFolder(folder) as output:
+        output.file("colmap").mkdir()
+        output.file("colmap/points.txt").write_text("old")
+        output.file("run.json").write_text(json.dumps({"files": output.names()}))
+        assert output.names() == ["colmap/points.txt", "run.json"]
+    assert (folder / "colmap" / "points.txt").read_text() == "old"
+    with OutputFolder(folder, force=True) as output:
+        output.file("colmap").mkdir()
+        output.file("colmap/points.txt").write_text("new")
+    assert (folder / "colmap" / "points.txt").read_text() == "new"
+    (folder / "run.json").write_text(json.dumps({"files": ["colmap/points.txt", "../mine.txt", "/mine.txt"]}))
+    (tmp_path / "mine.txt").write_text("keep")
+    run(folder, {"pipes.json": "new"}, force=True)
+    assert names(folder) == ["pipes.json", "run.json"]
+    assert (tmp_path / "mine.txt").exists()
+
+
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, InputError])
 def test_a_run_that_fails_leaves_nothing(tmp_path: Path, error: type[BaseException]) -> None:
     folder = tmp_path / "deep" / "results"
