@@ -76,7 +76,7 @@ def _on_region(
     return np.asarray(rows[np.abs(height) < band])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _cell_planes(
     points: FloatArray, starts: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray]:
@@ -118,7 +118,7 @@ def _cell_neighbours(cells: Cells) -> IntArray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _grow(
     mean: FloatArray,
     normal: FloatArray,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.hypotheses import Hypothesis
 from pipeprog_detect.inside import find_concave
 from pipeprog_detect.memory import Memory
-from pipeprog_detect.octree import Octree
+from pipeprog_detect.octree import THREADS, Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
 from pipeprog_detect.refinement import Jury, Measured
@@ -176,28 +178,31 @@ def _settled(
 
     The pipe found first had its neighbour's points as well: once both are known they are told apart.
     """
-    for turn in range(2):
+
+    def settled(pieces: list[int], again: bool) -> Candidate | None:
+        best = max(pieces, key=lambda piece: accepted[piece].points)
+        cylinder = spanning([accepted[piece].cylinder for piece in pieces], best=pieces.index(best))
+        band = accepted[best].band
+        margin = cylinder.radius * cylinder.axis
+        reach = 1.5 * cylinder.radius + 6.0 * band
+        others = [accepted[k].cylinder for k in range(len(accepted)) if k not in pieces]
+        others = [other for other in others if near(other, cylinder, reach)]
+        if again and len(pieces) == 1 and not others:
+            return accepted[best]
+        rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
+        points = own_points(tree.points[rows], cylinder, others)
+        candidate = settle(points, cylinder, band, whole=again or len(pieces) > 1)
+        if candidate is not None and is_pipe(candidate, sigma, config, _PROPOSED):
+            return candidate
+        # Where there are images, they will measure it.
+        return replace(accepted[best], cylinder=cylinder) if jury.sits else None
+
+    for again in (False, True):
         joined = join([candidate.cylinder for candidate in accepted])
-        settled = []
-        for pieces in joined:
-            best = max(pieces, key=lambda piece: accepted[piece].points)
-            cylinder = spanning([accepted[piece].cylinder for piece in pieces], best=pieces.index(best))
-            band = accepted[best].band
-            margin = cylinder.radius * cylinder.axis
-            reach = 1.5 * cylinder.radius + 6.0 * band
-            others = [accepted[k].cylinder for k in range(len(accepted)) if k not in pieces]
-            others = [other for other in others if near(other, cylinder, reach)]
-            if turn > 0 and len(pieces) == 1 and not others:
-                settled.append(accepted[best])
-                continue
-            rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
-            points = own_points(tree.points[rows], cylinder, others)
-            candidate = settle(points, cylinder, band, whole=turn > 0 or len(pieces) > 1)
-            if candidate is not None and is_pipe(candidate, sigma, config, _PROPOSED):
-                settled.append(candidate)
-            elif jury.sits:  # the images will measure it
-                settled.append(replace(accepted[best], cylinder=cylinder))
-        accepted = settled
+        # Most of it is compiled, and lets other threads run.
+        with ThreadPoolExecutor(THREADS) as pool:
+            measured = list(pool.map(settled, joined, repeat(again)))
+        accepted = [candidate for candidate in measured if candidate is not None]
     bends = elbows([candidate.cylinder for candidate in accepted])
     return [candidate for number, candidate in enumerate(accepted) if number not in bends]
 

@@ -156,7 +156,7 @@ def _fit_line(place: FloatArray, shift: FloatArray, weight: FloatArray) -> tuple
     return solved[0], solved[1]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _best_line(place: FloatArray, shift: FloatArray, allowed: FloatArray, apart: float) -> NDArray[np.bool_]:
     """Slices that agree with the line through two of them, at least `apart`, that most agree with, and closely."""
     count = len(place)

@@ -232,7 +232,7 @@ def _sandwich(
     return covariance
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _foot(x: float, y: float, radius: float, muu: float, muv: float, mvv: float) -> tuple[float, float, float]:
     """Foot (cos, sin) of the point on the circle in the metric of the tensor, and the residual across it [m]."""
     rho = np.sqrt(x * x + y * y) + 1e-12
@@ -256,7 +256,7 @@ def _foot(x: float, y: float, radius: float, muu: float, muv: float, mvv: float)
     return c, s, (x - radius * c) * c + (y - radius * s) * s
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _feet(
     x: FloatArray, y: FloatArray, radius: float, muu: float, muv: float, mvv: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -266,7 +266,7 @@ def _feet(
     return cosine, sine, residual
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _iterate(
     points: FloatArray,
     normals: FloatArray,

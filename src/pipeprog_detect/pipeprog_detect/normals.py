@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_detect.octree import IntArray, Octree, neighbour_runs
+from pipeprog_detect.octree import THREADS, IntArray, Octree, neighbour_runs
 from pipeprog_detect.pipe import FloatArray
 
 # A quadric has six coefficients: twice as many points leave something to judge it by.
@@ -54,9 +56,18 @@ def surfaces(tree: Octree, sites: Octree, scale: float, sigma: float) -> Surface
     if tree.quantum * 2.0**level < scale:
         level += 1
     cells = tree.cells(level)
-    table, count = _fit_sites(
-        sites.points, sites.keys >> (3 * level), tree.points, cells.keys, cells.starts, level, scale, sigma
-    )
+    own_cells = sites.keys >> (3 * level)
+
+    def fit(part: slice) -> tuple[FloatArray, IntArray]:
+        return _fit_sites(
+            sites.points[part], own_cells[part], tree.points, cells.keys, cells.starts, level, scale, sigma
+        )
+
+    # The compiled loop lets other threads run.
+    bounds = np.linspace(0, len(sites.points), THREADS + 1).astype(int)
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = list(pool.map(fit, [slice(first, last) for first, last in pairwise(bounds)]))
+    table, count = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return Surfaces(
         scale,
         sites.points,
@@ -94,7 +105,7 @@ def estimate_noise(tree: Octree, most_cells: int = 20000) -> float:
     return float(np.median(clean)) / _TUKEY_SHRINKAGE if len(clean) else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _quadric_rows(offset: FloatArray, frame: FloatArray, scale: float) -> tuple[float, float, float]:
     x = (offset[0] * frame[0, 0] + offset[1] * frame[0, 1] + offset[2] * frame[0, 2]) / scale
     y = (offset[0] * frame[1, 0] + offset[1] * frame[1, 1] + offset[2] * frame[1, 2]) / scale
@@ -102,7 +113,7 @@ def _quadric_rows(offset: FloatArray, frame: FloatArray, scale: float) -> tuple[
     return x, y, z
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _principal(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean, standard deviations ascending, and principal directions as rows (normal first)."""
     mean = np.zeros(3)
@@ -121,7 +132,7 @@ def _principal(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return mean, np.sqrt(np.maximum(values, 0.0)), np.ascontiguousarray(vectors.T)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _solve_quadric(
     points: FloatArray, origin: FloatArray, frame: FloatArray, scale: float, sigma: float, rounds: int
 ) -> tuple[FloatArray, float, float, float]:
@@ -168,7 +179,7 @@ def _solve_quadric(
     return q, rms, share, variance
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fit_sites(
     sites: FloatArray,
     site_cells: IntArray,
@@ -245,7 +256,7 @@ def _fit_sites(
     return table, count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _patch_residuals(points: FloatArray, first: IntArray, last: IntArray, scale: float) -> FloatArray:
     out = np.zeros(len(first))
     for c in range(len(first)):

@@ -6,6 +6,7 @@ of the order in which the points came.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,8 @@ from pipeprog_detect.pipe import FloatArray
 
 IntArray = NDArray[np.int64]
 
+# For loops over independent parts; what they give does not depend on it.
+THREADS = min(os.cpu_count() or 1, 8)
 # 21 bits an axis fill an int64 key; 1/32 mm is far below any cloud's noise and spans 65 m.
 _BITS = 21
 _FINEST = 2.0**-15
@@ -46,6 +49,7 @@ class Octree:
     origin: FloatArray
     quantum: float
     _cells: dict[int, Cells] = field(default_factory=dict, repr=False, compare=False)
+    _centres: dict[int, FloatArray] = field(default_factory=dict, repr=False, compare=False)
 
     def level_of(self, size: float) -> int:
         """Level whose cells are nearest in size (in octaves) to `size` [m]."""
@@ -61,7 +65,9 @@ class Octree:
 
     def centres(self, cells: Cells) -> FloatArray:
         """Centres of cells (M, 3) [m]."""
-        return self.origin + (decode(cells.keys) + 0.5) * cells.size
+        if cells.level not in self._centres:
+            self._centres[cells.level] = self.origin + (decode(cells.keys) + 0.5) * cells.size
+        return self._centres[cells.level]
 
     def subset(self, mask: NDArray[np.bool_]) -> Octree:
         """The tree of the points where mask (N,) is true."""
@@ -121,7 +127,7 @@ def build(points: FloatArray) -> Octree:
     return Octree(points[order], keys, order, origin, quantum)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _spread(value: int) -> int:
     """Put two zero bits before each of the 21 low bits."""
     value = (value | value << 32) & 0x1F00000000FFFF
@@ -131,7 +137,7 @@ def _spread(value: int) -> int:
     return (value | value << 2) & 0x1249249249249249
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _gather(value: int) -> int:
     """Undo _spread."""
     value &= 0x1249249249249249
@@ -142,7 +148,7 @@ def _gather(value: int) -> int:
     return (value | value >> 32) & 0x1FFFFF
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _grid(points: FloatArray, origin: FloatArray, quantum: float) -> IntArray:
     out = np.empty(points.shape, np.int64)
     for i in range(len(points)):
@@ -151,7 +157,7 @@ def _grid(points: FloatArray, origin: FloatArray, quantum: float) -> IntArray:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def encode(grid: IntArray) -> IntArray:
     """Morton keys (N,) of cells (N, 3), 21 bits a coordinate."""
     keys = np.empty(len(grid), np.int64)
@@ -160,7 +166,7 @@ def encode(grid: IntArray) -> IntArray:
     return keys
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def decode(keys: IntArray) -> IntArray:
     """Cells (N, 3) of Morton keys (N,)."""
     grid = np.empty((len(keys), 3), np.int64)
@@ -171,7 +177,7 @@ def decode(keys: IntArray) -> IntArray:
     return grid
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def neighbour_runs(key: int, cell_keys: IntArray, cell_starts: IntArray, level: int, runs: IntArray) -> int:
     """Runs of points in the 27 cells around cell `key`, written to runs (27, 2); returns how many are occupied."""
     limit = 1 << (_BITS - level)

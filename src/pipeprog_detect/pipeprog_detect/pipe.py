@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +39,12 @@ class Cylinder:
     end: FloatArray
     radius: float
 
-    @property
+    @cached_property
     def length(self) -> float:
         """Distance between the ends [m]."""
         return float(np.linalg.norm(self.end - self.start))
 
-    @property
+    @cached_property
     def axis(self) -> FloatArray:
         """Unit vector (3,) from start to end."""
         return (self.end - self.start) / self.length

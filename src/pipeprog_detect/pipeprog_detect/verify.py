@@ -15,6 +15,8 @@ from pipeprog_detect.octree import Octree
 from pipeprog_detect.pipe import Cylinder, FloatArray
 
 _FIT_POINTS = 2500
+# Where a pipe goes on is seen on some of its points as well as on all.
+_FOLLOW_POINTS = 20_000
 _FINAL_POINTS = 12000
 # Noise above this share of the radius blurs half a circle into a blob whose circle fit is far too small.
 _BLURRED = 0.16
@@ -77,7 +79,7 @@ def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma
         rows = tree.near_segment(
             cylinder.start - step * axis, cylinder.end + step * axis, cylinder.radius + 4.0 * wide * reach
         )
-        points = tree.points[rows[free[rows]]]
+        points = _spread_out(tree.points[rows[free[rows]]], _FOLLOW_POINTS)
         if len(points) < 30:
             return None
         grown = np.inf
