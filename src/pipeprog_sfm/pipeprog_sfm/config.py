@@ -37,7 +37,7 @@ class BoardConfig:
     )
     upright: bool = field(
         default=True,
-        metadata={"description": "the first board hangs plumb: its y axis becomes the map's z axis", "unit": ""},
+        metadata={"description": "the board that is seen first hangs plumb: its y axis tells what is up", "unit": ""},
     )
 
 

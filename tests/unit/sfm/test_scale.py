@@ -207,6 +207,26 @@ def test_a_board_that_contradicts_its_file_is_refused_with_the_residuals(offset)
     assert caught.value.reason == "contradiction"
 
 
+def test_of_two_boards_the_bent_one_is_refused_and_the_other_counts():
+    centres = LOPSIDED.centres.copy()
+    centres[2] += [0.0, 0.004, 0.0]
+    right = np.eye(4)
+    right[0, 3] = 1.0
+    boards = ((BOARD, np.eye(4)), (Board("B", LOPSIDED.circle_radius, centres), right))
+    walk = Walk(3, views=14, noise=0.03, pose_noise=0.0003, span=3.0, follow=1.0, boards=boards)
+    estimate = walk.estimate((BOARD, LOPSIDED))
+    assert [place.board for place in estimate.placements] == ["A"]
+    assert "board B contradicts its file" in estimate.warnings[0]
+    assert "3: " in estimate.warnings[0]
+    assert abs(estimate.scale * walk.factor - 1) < 4 * estimate.sigma
+
+
+def test_without_anything_that_tells_the_vertical_there_is_no_map():
+    with pytest.raises(NoScaleError, match="what is up") as caught:
+        Walk(1).estimate(config=replace(CONFIG, upright=False))
+    assert caught.value.reason == "no_vertical"
+
+
 def test_reasons_for_no_scale():
     walk = Walk(8)
     with pytest.raises(NoScaleError, match="nothing tells the scale") as caught:
