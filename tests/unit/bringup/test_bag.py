@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
 from pipeprog_bringup import cdr
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.bag import Bag, Motion
 from pipeprog_bringup.bag_writer import BagWriter, message_definition
 from pipeprog_camera.errors import InputError
 from tests.unit.bringup.recordings import (
@@ -259,3 +259,30 @@ def test_written_recordings_are_read_back_and_carry_their_definitions(tmp_path: 
     assert decoded[0].k == [60.0, 0, 31.5, 0, 60.0, 23.5, 0, 0, 1]
     assert decoded[1].header.frame_id == "camera"
     assert "MSG: builtin_interfaces/Time" in message_definition(cdr.CAMERA_INFO)
+
+
+def motion_messages(odometries: list[str]) -> list[tuple[str, str, int, bytes]]:
+    told = [(topic, cdr.ODOMETRY, START + STEP // 2, b"odometry") for topic in odometries]
+    told += [("/tf", cdr.TF, START + STEP // 3, b"moving"), ("/tf_static", cdr.TF, START + 3 * STEP, b"mounted")]
+    return sorted([*camera_messages(3), *told], key=lambda message: message[2])
+
+
+def test_motion_comes_between_the_frames_and_static_transforms_first(tmp_path: Path) -> None:
+    bag = Bag.open(write_bag(tmp_path / "bag.mcap", motion_messages(["/odom"])))
+    told = [(one.topic, one.data) if isinstance(one, Motion) else one.stamp for one in bag.with_motion()]
+    assert told == [
+        *(("/tf_static", b"mounted"), START, ("/tf", b"moving"), ("odometry", b"odometry")),
+        *(START + STEP, START + 2 * STEP),
+    ]
+    assert [frame.stamp for frame in bag] == [START, START + STEP, START + 2 * STEP]
+    assert bag.notes == []
+
+
+def test_of_several_odometries_none_is_guessed(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "bag.mcap", motion_messages(["/wheel", "/visual"]))
+    bag = Bag.open(path)
+    assert "odometry" not in bag.motion_topics.values()
+    assert "--odometry-topic /visual or --odometry-topic /wheel" in bag.notes[0]
+    assert Bag.open(path, odometry_topic="/wheel").motion_topics["/wheel"] == "odometry"
+    with pytest.raises(InputError, match="--imu-topic /imu is not among its topics: none of that type"):
+        Bag.open(path, imu_topic="/imu")
