@@ -67,6 +67,9 @@ class SfmNode(Node):
         self._transforms: list[Transform] = []  # since the last keyframe, as are the accelerations
         self._accelerations: list[Acceleration] = []
         self._moved = 0
+        self._map_frame = ""
+        self._map_trajectory: Trajectory | None = None
+        self._correction = 0.0  # of the last map: how far it has moved a keyframe, m
         self._ready = False
         self._status: Status | None = None
         self._finish: tuple[int, Future] | None = None
@@ -274,6 +277,11 @@ class SfmNode(Node):
     def _publish_map(self, metric_map: MetricMap) -> None:
         header = self._publish_poses(metric_map.trajectory)
         self._map_stamp = self._pose_stamp
+        if metric_map.scale.frame != self._map_frame:
+            self._map_frame = metric_map.scale.frame
+            self.get_logger().info(f"frame map: {self._map_frame}")
+        self._correction = metric_map.trajectory.correction(self._map_trajectory)
+        self._map_trajectory = metric_map.trajectory
         cloud = metric_map.cloud
         self._points.publish(
             messages.point_cloud(header, cloud.points, colors=cloud.colors, normals=cloud.normals, views=cloud.views)
@@ -309,6 +317,8 @@ class SfmNode(Node):
             "models": status.models,
             "reprojection error [px]": round(status.reprojection_error, 3),
             "map revision": self._revision,
+            "map frame": self._map_frame,
+            "map correction [m]": round(self._correction, 4),
         }
         if self._dropped or status.message:
             return DiagnosticStatus.WARN, status.message or "keyframes were dropped: the machine cannot keep up", values

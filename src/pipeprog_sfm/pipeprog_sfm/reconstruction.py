@@ -51,6 +51,14 @@ class Trajectory:
     stamps: NDArray[np.int64]
     map_from_camera: FloatArray
 
+    def correction(self, earlier: Trajectory | None) -> float:
+        """How far the keyframe is moved that has moved farthest since an earlier trajectory, m."""
+        if earlier is None:
+            return 0.0
+        _, own, theirs = np.intersect1d(self.stamps, earlier.stamps, return_indices=True)
+        moved = self.map_from_camera[own, :3, 3] - earlier.map_from_camera[theirs, :3, 3]
+        return float(np.linalg.norm(moved, axis=1).max(initial=0.0))
+
 
 @dataclass(frozen=True)
 class MetricMap:
