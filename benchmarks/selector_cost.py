@@ -1,6 +1,6 @@
 """What choosing a frame costs beside decoding it: one run over one recording, at its size and at 4K.
 
-    .venv/bin/python -m benchmarks.selector_cost [BAG.mcap ...]
+    .venv/bin/python -m benchmarks.selector_cost [demo] [lab:SEED[:OPTION...]] [BAG.mcap ...]
 
 Prints, for each recording, the time of the selector alone per frame over that of a full-size cv2.imdecode of the same
 frames, both on one thread, and writes results/selector_cost.json beside this file. The 4K frames are those of the
@@ -20,13 +20,13 @@ import numpy as np
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CompressedImage
 
+from benchmarks.recordings import made, named
 from pipeprog_bringup.bag import Bag
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.selector import FrameSelector
 
-ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).parent / "results" / "selector_cost.json"
 ROUNDS = 5  # the least of them counts: other work on the machine only adds
 ENLARGED = 40  # frames, of 1 MB each
@@ -34,11 +34,12 @@ ENLARGED = 40  # frames, of 1 MB each
 Encoded = list[tuple[int, bytes]]
 
 
-def main(paths: Sequence[Path]) -> None:
+def main(names: Sequence[str]) -> None:
     """Measure each recording at its size and at 4K."""
     cv2.setNumThreads(1)
     rows = []
-    for path in paths:
+    for name in names:
+        path = made(named(name)).bag
         bag = Bag.open(path)
         frames = [(frame.stamp, bytes(deserialize_message(frame.data, CompressedImage).data)) for frame in bag]
         rows.append(_measure(path.stem, frames, bag.camera))
@@ -51,7 +52,9 @@ def main(paths: Sequence[Path]) -> None:
             f"{row['recording']:16} {row['size']:>10} {row['fps']:5.1f} {row['frames']:6d} {row['chosen']:6d} "
             f"{row['decode_ms']:6.2f} ms {row['selector_ms']:6.2f} ms {row['ratio']:6.2f}"
         )
-    RESULTS.write_text(json.dumps({"must": 1.0, "aim": 0.4, "rows": rows}, indent=1) + "\n")
+    command = " ".join(["python -m benchmarks.selector_cost", *names])
+    title = "Choosing keyframes: CPU time per frame, beside full-size decoding of the same frames"
+    RESULTS.write_text(json.dumps({"title": title, "command": command, "rows": rows}, indent=1) + "\n")
 
 
 def _measure(name: str, frames: Encoded, camera: Camera) -> dict[str, str | float | int]:
@@ -99,4 +102,4 @@ def _enlarged(encoded: bytes, factor: float, seed: int) -> bytes:
 
 
 if __name__ == "__main__":
-    main([Path(argument) for argument in sys.argv[1:]] or [ROOT / "bags" / "demo.mcap"])
+    main(sys.argv[1:] or ["demo"])
