@@ -21,6 +21,8 @@ WINDOW_OF_HALF_WIDTH = 0.8
 # Blur of a sharp image, lens and pixel together, and the ones that are tried [px].
 SHARP = 0.5
 BLURS = np.array([0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.5])
+# Profiles that are compared with the model at a time: some megabytes.
+_BLOCK = 1024
 # Share of Schlick's reflectance that a painted or a rough metal surface keeps at grazing incidence.
 RIM = 0.25
 
@@ -48,15 +50,18 @@ def profiles(views: Sequence[View], at: Stations, offsets: FloatArray, rows: int
             continue
         pixel, normal = at.pixel[chosen], at.normal[chosen]
         tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-        feet = (pixel[:, None] + shifts[None, :, None] * tangent[:, None]).reshape(-1, 1, 2)
-        where = feet + offsets[None, :, None] * np.repeat(normal, rows, axis=0)[:, None]
+        feet = (pixel[:, None] + shifts[None, :, None] * tangent[:, None]).reshape(-1, 2)
+        outward = np.repeat(normal, rows, axis=0)
         size = np.array([view.camera.width, view.camera.height])
-        tips = where[:, [0, -1]]
+        tips = np.stack([feet + offsets[0] * outward, feet + offsets[-1] * outward])
         low = np.clip(np.floor(tips.min(axis=(0, 1))).astype(int) - 2, 0, size - 1)
         high = np.clip(np.ceil(tips.max(axis=(0, 1))).astype(int) + 3, low + 1, size)
         light = cv2.LUT(np.ascontiguousarray(view.image[low[1] : high[1], low[0] : high[0]]), LINEAR_LIGHT)
-        where = (where - low).astype(np.float32)
-        sampled = cv2.remap(light, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        along = offsets.astype(np.float32)
+        x, y = (np.multiply.outer(outward[:, k].astype(np.float32), along) for k in (0, 1))
+        x += (feet[:, :1] - low[0]).astype(np.float32)
+        y += (feet[:, 1:] - low[1]).astype(np.float32)
+        sampled = cv2.remap(light, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         result[chosen] = sampled.reshape(len(chosen), rows, -1).mean(axis=1, dtype=np.float32)
     return result
 
@@ -127,11 +132,19 @@ def _costs(
     for key in np.unique(group):
         members = np.flatnonzero(group == key)
         width = float(np.exp(key * np.log(1.15)))
-        for index, trial in enumerate(trials):
-            onto = np.linalg.qr(limb_basis(offsets - trial, width, blur))[0]
-            part = values[members] @ onto
-            cost[members, index] = total[members] - np.einsum("ij,ij->i", part, part)
+        onto = _limb_spaces(width, blur, tuple(offsets.tolist()), tuple(trials.tolist()))
+        for block in np.array_split(members, -(-len(members) // _BLOCK)):
+            part = (values[block] @ onto).reshape(len(block), len(trials), -1)
+            cost[block] = total[block, None] - np.einsum("itk,itk->it", part, part)
     return np.maximum(cost, 0.0)
+
+
+@lru_cache(maxsize=64)
+def _limb_spaces(width: float, blur: float, offsets: tuple[float, ...], trials: tuple[float, ...]) -> FloatArray:
+    """Orthonormal bases (Q, T * 5 or 6) of the limb model at offsets (Q,) px for each trial position (T,)."""
+    grid = np.array(offsets)
+    bases = [np.linalg.qr(limb_basis(grid - trial, width, blur))[0] for trial in trials]
+    return np.asarray(np.concatenate(bases, axis=1), np.float64)
 
 
 def _smooth_cost(values: FloatArray, offsets: FloatArray, half_width: FloatArray) -> FloatArray:
