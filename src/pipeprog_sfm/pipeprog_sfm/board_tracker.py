@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +68,13 @@ class BoardTracker:
             self._ellipses.pop(stamp, None)
             self._observations.pop(stamp, None)
 
-    def estimate(self, poses: Mapping[int, FloatArray], covariance: PoseCovariance | None = None) -> ScaleEstimate:
-        """Scale and map frame for (4, 4) poses camera_from_model by stamp; raises NoScaleError with the reason."""
+    def estimate(
+        self,
+        poses: Mapping[int, FloatArray],
+        covariance: PoseCovariance | None = None,
+        points: Callable[[], FloatArray] | None = None,
+    ) -> ScaleEstimate:
+        """Scale and map frame for (4, 4) poses camera_from_model by stamp; the rest as for `estimate_scale`."""
         if self._camera is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
         evidence = Evidence(
@@ -81,4 +86,4 @@ class BoardTracker:
             self._accelerations,
             self._frame,
         )
-        return estimate_scale(evidence, poses, self._camera, self._config, self._odometry, covariance)
+        return estimate_scale(evidence, poses, self._camera, self._config, self._odometry, covariance, points)

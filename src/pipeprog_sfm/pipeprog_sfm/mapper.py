@@ -225,6 +225,12 @@ class Mapper:
         own = model.point_of[model.features(model.stamps.index(stamp))]
         return model.points[own[own >= 0]]
 
+    def points(self, stamp: int) -> FloatArray:
+        """(P, 3) points of the model that holds a keyframe."""
+        model = self._model_of(stamp)
+        assert model is not None
+        return model.points[np.unique(model.point_of[model.point_of >= 0])]
+
     def observations(self) -> tuple[FloatArray, dict[int, tuple[IntArray, FloatArray]]]:
         """(P, 3) points of the published model, and what each keyframe sees of them.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +13,7 @@ from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses
 from pipeprog_sfm.gravity import GravityError, gravity
-from pipeprog_sfm.map_frame import Vertical, board_vertical, map_from_model, path_vertical
+from pipeprog_sfm.map_frame import Vertical, board_vertical, camera_up, map_from_model, path_vertical
 from pipeprog_sfm.motion import Acceleration, NoPathError, TransformTree
 from pipeprog_sfm.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.placement import BoardPlacement, PlacedBoard, contradiction, measure, place_boards, sensitivity
@@ -26,6 +26,7 @@ from pipeprog_sfm.scale import (
     combine,
     distance_measurement,
 )
+from pipeprog_sfm.structure import StructureError, structure_vertical
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ def estimate_scale(
     config: BoardConfig,
     odometry: OdometryConfig = OdometryConfig(),  # noqa: B008  # frozen
     covariance: PoseCovariance | None = None,
+    points: Callable[[], FloatArray] | None = None,
 ) -> ScaleEstimate:
     """Metric scale and map frame of a model.
 
@@ -68,6 +70,7 @@ def estimate_scale(
         config: eccentricity, tolerance, upright.
         odometry: how good odometry is.
         covariance: of functions of the poses; None takes these for exact.
+        points: gives (N, 3) points of the model, should nothing else tell the vertical.
 
     Raises:
         NoScaleError: no source of scale was seen, or too little of it, or a board contradicts its file, or nothing
@@ -119,10 +122,12 @@ def estimate_scale(
     if path is not None and len(path.stamps):
         verticals.append(path_vertical(path, poses))
     if not verticals:
-        raise NoScaleError(
-            "no_vertical",
-            "nothing tells what is up: hang the board upright and set upright to true, or record an IMU or odometry",
-        )
+        try:
+            verticals.append(structure_vertical(points() if points else np.empty((0, 3)), camera_up(poses)))
+        except StructureError as error:
+            raise NoScaleError(
+                "no_vertical", f"{error}: hang the board upright and set upright to true, or record an IMU or odometry"
+            ) from error
     frame, description, disagreements = map_from_model(combined.scale, origin, verticals, poses)
     return ScaleEstimate(
         combined.scale,

@@ -224,13 +224,16 @@ class Reconstruction:
                 "film textured surroundings while moving sideways, and check the calibration"
             )
         for number, piece in enumerate(pieces):
+            first = next(iter(piece))
             try:
-                self._scale = self._targets.estimate(piece, partial(self._mapper.covariance, next(iter(piece))))
+                self._scale = self._targets.estimate(
+                    piece, partial(self._mapper.covariance, first), partial(self._mapper.points, first)
+                )
             except NoScaleError as error:
                 if number == 0:
                     self._reason = str(error)
                 continue
-            self._mapper.publish(next(iter(piece)))
+            self._mapper.publish(first)
             return
 
 

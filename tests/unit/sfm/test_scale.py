@@ -14,6 +14,7 @@ from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.metric import Evidence, estimate_scale
 from pipeprog_sfm.placement import similarity
 from pipeprog_sfm.scale import NoScaleError
+from pipeprog_sfm.structure import StructureError, structure_vertical
 
 CONFIG = BoardConfig()
 AT_ORIGIN = (BOARD, np.eye(4))
@@ -225,6 +226,38 @@ def test_without_anything_that_tells_the_vertical_there_is_no_map():
     with pytest.raises(NoScaleError, match="what is up") as caught:
         Walk(1).estimate(config=replace(CONFIG, upright=False))
     assert caught.value.reason == "no_vertical"
+
+
+def room(rng, surfaces):
+    """Points (N, 3) on surfaces of a room in a board's frame (y up), each a coordinate and its value; 5 mm noise."""
+    parts = []
+    for axis, value in surfaces:
+        points = rng.uniform([-2, -1, 0], [2, 1, 2], (3000, 3))
+        points[:, axis] = value
+        parts.append(points + rng.normal(0, 0.005, points.shape))
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("surfaces", [[(0, -2.0), (2, 0.0)], [(1, -1.0)], [(0, -2.0), (1, -1.0), (2, 0.0)]])
+def test_floor_and_walls_tell_what_is_up(surfaces):
+    rng = np.random.default_rng(0)
+    walk = Walk(1, roll=0.2)
+    points = room(rng, surfaces) @ walk.model_from_board[:3, :3].T + walk.model_from_board[:3, 3]
+    seen = {stamp: identify(ellipses, (BOARD,), CAMERA) for stamp, ellipses in walk.ellipses.items()}
+    config = replace(CONFIG, upright=False)
+    estimate = estimate_scale(
+        Evidence((BOARD,), (), seen, walk.ellipses), walk.poses, CAMERA, config, points=lambda: points
+    )
+    up = (estimate.map_from_model @ walk.model_from_board)[:3, 1]
+    assert np.degrees(np.arccos(up @ [0, 0, 1] / np.linalg.norm(up))) < 0.5
+    assert "floor and walls" in estimate.frame
+
+
+def test_one_wall_or_a_cloud_of_nothing_tell_no_vertical():
+    rng = np.random.default_rng(1)
+    for points in (room(rng, [(2, 0.0)]), rng.normal(0, 1, (5000, 3)), np.empty((0, 3))):
+        with pytest.raises(StructureError):
+            structure_vertical(points, np.array([0.0, 1.0, 0.0]))
 
 
 def test_reasons_for_no_scale():
