@@ -78,12 +78,12 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
     assert len(considered) == 16
 
     result = json.loads((one / "pipes.json").read_text())
-    assert result.keys() == {"frame_id", "scale", "pipes", "classes"}
+    assert result.keys() >= {"frame_id", "scale", "pipes", "classes"}
     assert result["frame_id"] == "map"
     assert result["scale"]["source"] == "board"
     assert 0 < result["scale"]["sigma"] < 0.01
     for pipe in result["pipes"]:
-        assert pipe.keys() == {
+        assert pipe.keys() >= {
             *("id", "start", "end", "radius", "radius_sigma", "length"),
             *("class", "class_probability", "visible_arc_deg", "rmse", "points"),
         }
@@ -97,7 +97,7 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("options", "reason"),
-    [(["--board", str(BOARD)], "no board (A) was identified"), ([], "no board file was given")],
+    [(["--board", str(BOARD)], "no board (A) was identified"), ([], "nothing tells the scale")],
     ids=["out of view", "not given"],
 )
 def test_without_a_board_the_reason_is_told_and_nothing_written(
