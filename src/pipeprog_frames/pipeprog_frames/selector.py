@@ -63,7 +63,8 @@ class FrameSelector:
     been looked at on arrival.
 
     A frame that shows nothing of what came before is a jump of the camera or an accident: a hand before the lens, a
-    damaged image. It is a keyframe unless the view from before it comes back within the window.
+    damaged image. It is a keyframe unless the view from before it comes back within the window, or the next frame, too
+    soon after it for any camera to have turned away, shows nothing of it either.
     """
 
     def __init__(self, config: FramesConfig, camera: Camera) -> None:
@@ -178,9 +179,12 @@ class FrameSelector:
         probe.start(last)
         if not probe.track(gray).tracked:
             return []
-        decisions = self._leave_window() + [stranger.decided(True, JUMP) for stranger in self._strangers]
-        self._carry_on(self._strangers[-1], last)
-        self._strangers.clear()
+        decisions = self._leave_window()
+        while len(self._strangers) > 1:
+            decisions.append(self._dismiss_stranger())
+        stranger = self._strangers.pop()
+        decisions.append(stranger.decided(True, JUMP))
+        self._carry_on(stranger, last)
         candidate.track = self._tracker.track(gray)
         return decisions
 
@@ -223,8 +227,15 @@ class FrameSelector:
                 held = self._window or self._unseen
                 decisions.append(held.popleft().decided(False, "overlap suffices"))
             else:
-                decisions.append(self._strangers.popleft().decided(True, JUMP))
+                decisions.append(self._dismiss_stranger())
         return decisions
+
+    def _dismiss_stranger(self) -> Decision:
+        """Decides on a frame that neither the frames before it nor the next one know."""
+        stranger = self._strangers.popleft()
+        if self._strangers[0].stamp - stranger.stamp < MAX_UNSEEN:
+            return stranger.decided(False, STRANGE)
+        return stranger.decided(True, JUMP)
 
     def _leave_window(self) -> list[Decision]:
         """Decides on the window where nothing follows on from it: its last frame is kept if it adds anything."""
