@@ -37,6 +37,15 @@ ARGUMENTS = [
         description="Topic of the camera's calibration, sensor_msgs/CameraInfo. K = 0 is refused.",
     ),
     DeclareLaunchArgument(
+        "odometry",
+        default_value="odometry",
+        description="Topic of the robot's odometry, nav_msgs/Odometry: a source of scale. /tf_static says where the "
+        "camera is mounted.",
+    ),
+    DeclareLaunchArgument(
+        "imu", default_value="imu", description="Topic of the robot's IMU, sensor_msgs/Imu: it tells what is up."
+    ),
+    DeclareLaunchArgument(
         "image_transport",
         default_value="compressed",
         choices=["raw", "compressed"],
@@ -90,11 +99,12 @@ def generate_launch_description() -> LaunchDescription:
         ("image/compressed", LaunchConfiguration("compressed_image")),
         ("camera_info", LaunchConfiguration("camera_info")),
     ]
+    motion = [("odometry", LaunchConfiguration("odometry")), ("imu", LaunchConfiguration("imu"))]
     return LaunchDescription(
         [
             *ARGUMENTS,
             pipeprog_node("frames", {"image_transport": text("image_transport")}, camera),
-            pipeprog_node("sfm", {"board": text("board")}, []),
+            pipeprog_node("sfm", {"board": text("board")}, motion),
             pipeprog_node("detect", {"boq": text("boq")}, []),
         ]
     )
