@@ -1,6 +1,7 @@
 """Outer diameters of standard pipe sizes, so that a bill may say `DN50 steel` in place of a radius.
 
-Steel: EN 10255 and EN 10220 series 1 by DN, ASME B36.10 by NPS (inches). Copper: EN 1057, named by outer diameter.
+Steel: EN 10220 series 1 by DN, with which EN 10255 agrees but for DN150 (`DN150 EN 10255 steel`), ASME B36.10 by NPS
+(inches). Copper: EN 1057, named by outer diameter.
 PVC: EN 1329, EN 1401 and EN ISO 1452, where DN is the outer diameter.
 """
 
@@ -13,20 +14,22 @@ from dataclasses import dataclass
 _STEEL_DN = {
     "6": 10.2, "8": 13.5, "10": 17.2, "15": 21.3, "20": 26.9, "25": 33.7, "32": 42.4, "40": 48.3, "50": 60.3,
     "65": 76.1, "80": 88.9, "100": 114.3, "125": 139.7, "150": 168.3, "200": 219.1, "250": 273.0, "300": 323.9,
-    "350": 355.6, "400": 406.4, "450": 457.0, "500": 508.0, "600": 610.0,
+    "350": 355.6, "400": 406.4, "450": 457.0, "500": 508.0, "600": 610.0, "150 EN 10255": 165.1,
 }  # fmt: skip
 _STEEL_NPS = {
     "1/8": 10.3, "1/4": 13.7, "3/8": 17.1, "1/2": 21.3, "3/4": 26.7, "1": 33.4, "1-1/4": 42.2, "1-1/2": 48.3,
     "2": 60.3, "2-1/2": 73.0, "3": 88.9, "3-1/2": 101.6, "4": 114.3, "5": 141.3, "6": 168.3, "8": 219.1, "10": 273.0,
-    "12": 323.8, "14": 355.6, "16": 406.4, "18": 457.0, "20": 508.0, "24": 610.0,
+    "12": 323.8, "14": 355.6, "16": 406.4, "18": 457.0, "20": 508.0, "22": 559.0, "24": 610.0,
 }  # fmt: skip
-_COPPER = (6, 8, 10, 12, 14, 15, 16, 18, 22, 28, 35, 42, 54, 64, 66.7, 76.1, 88.9, 108, 133, 159, 219, 267)
+_COPPER = (
+    6, 8, 10, 12, 14, 15, 16, 18, 22, 25, 28, 35, 40, 42, 54, 64, 66.7, 70, 76.1, 80, 88.9, 108, 133, 159, 219, 267,
+)  # fmt: skip
 _PVC = (32, 40, 50, 63, 75, 90, 110, 125, 140, 160, 180, 200, 225, 250, 280, 315, 355, 400, 450, 500)
 
 # Standard deviation of the outer diameter: half of what the standards allow. Steel +-1 %, at least +-0.5 mm; copper
-# +-0.11 mm at most in usual sizes; PVC 0 to +0.3 % + 0.1 mm.
+# with its ovality +-0.11 mm up to 54 mm, 0.2 up to 108, 0.7 up to 159, 1.5 beyond; PVC 0 to +0.3 % + 0.1 mm.
 _STEEL_RELATIVE, _STEEL_LEAST = 0.005, 0.25
-_COPPER_TOLERANCE = 0.06
+_COPPER_TOLERANCES = ((54.0, 0.06), (108.0, 0.1), (159.0, 0.35), (267.0, 0.75))
 _PVC_RELATIVE, _PVC_LEAST = 0.0015, 0.1
 
 
@@ -42,9 +45,12 @@ def _table() -> dict[str, Size]:
     def steel(diameter: float) -> Size:
         return Size(1e-3 * diameter, 1e-3 * max(_STEEL_RELATIVE * diameter, _STEEL_LEAST))
 
+    def copper(diameter: float) -> float:
+        return next(tolerance for largest, tolerance in _COPPER_TOLERANCES if diameter <= largest)
+
     table = {f"DN{name} steel": steel(diameter) for name, diameter in _STEEL_DN.items()}
     table |= {f"NPS {name} steel": steel(diameter) for name, diameter in _STEEL_NPS.items()}
-    table |= {f"{diameter:g} copper": Size(1e-3 * diameter, 1e-3 * _COPPER_TOLERANCE) for diameter in _COPPER}
+    table |= {f"{diameter:g} copper": Size(1e-3 * diameter, 1e-3 * copper(diameter)) for diameter in _COPPER}
     table |= {
         f"DN{diameter} PVC": Size(1e-3 * diameter, 1e-3 * max(_PVC_RELATIVE * diameter, _PVC_LEAST))
         for diameter in _PVC

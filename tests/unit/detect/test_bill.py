@@ -46,7 +46,11 @@ classes:
         ("steel dn 50", 60.3),
         ("NPS 2-1/2 steel", 73.0),
         ('NPS 2" steel', 60.3),
+        ("DN150 steel", 168.3),
+        ("DN150 EN 10255 steel", 165.1),
+        ("NPS 5 steel", 141.3),
         ("22 copper", 22.0),
+        ("267 copper", 267.0),
         ("copper 22 mm", 22.0),
         ("DN110 PVC", 110.0),
     ],
@@ -78,6 +82,8 @@ def test_standard_sizes(tmp_path: Path, size: str, diameter_mm: float) -> None:
         ),
         (entry("color: red"), "needs one of outer_radius_mm, outer_diameter_mm, size, not none"),
         (entry("outer_radius_mm: 3, colour: red"), "unknown key 'colour' in class 'DN65': did you mean 'color'"),
+        (entry("outer_radius_mm: 30, wall_mm: 40"), "wall_mm is 40, more than the radius"),
+        (entry("outer_radius_mm: 30, wall_mm: -1"), "wall_mm is -1: write a number above zero"),
         (entry("size: DN50 stell"), "unknown size 'DN50 stell': did you mean 'DN50 steel'"),
         (entry("size: 3"), "unknown size '3': did you mean"),
         (entry("outer_radius_mm: 3, color: gren"), "did you mean 'green'"),
@@ -101,6 +107,11 @@ def test_a_wrong_bill_is_told_what_to_mend(tmp_path: Path, text: str, told: str)
         load_bill(path)
     assert told in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+def test_a_wall_is_for_cameras_inside(tmp_path: Path) -> None:
+    (planned,) = load_bill(written(tmp_path, entry("outer_diameter_mm: 200, wall_mm: 5.9"))).classes
+    assert planned.bores == ((pytest.approx(0.0941), planned.tolerance),)
 
 
 def test_a_missing_bill_names_its_path(tmp_path: Path) -> None:
