@@ -18,7 +18,7 @@ from pipeprog_detect.edges import (
     profiles,
     sideways,
 )
-from pipeprog_detect.growth import KEPT, LEAST, grown
+from pipeprog_detect.growth import LEAST, grown
 from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.rim import End, find_end
@@ -44,6 +44,8 @@ MIN_STATIONS = 20
 MAX_GROWTH = 4
 # Where more of it has so much less support, radius and axis are taken from what was known before.
 WORSE = 0.9
+# ... and where it has less than half, it was something else.
+LOST = 0.5
 # Cylinders that are not there stay under 0.1 (see `support`); the stated sigma grows where little is seen.
 MIN_SUPPORT = 0.15
 
@@ -118,14 +120,14 @@ def refine(
     for _ in range(MAX_GROWTH if follow else 0):
         if refined is None:
             break
-        longer = grown(refined.cylinder, refined.share, views, others, refined.solution.view_offset, blur)
+        longer = grown(refined.cylinder, views, others, refined.solution.view_offset, blur)
         if longer.length < refined.cylinder.length + LEAST:
             break
         # The direction that was known of the shorter one leaves the longer one's ends uncertain by as much more.
         weaker = prior * (refined.cylinder.length / longer.length) ** 2
         turned = frame(longer, viewing_direction(longer, views))
         again = _fine(longer, (views, others, turned), blur, weaker, np.zeros(5))
-        if again is None or again.share < KEPT * refined.share:
+        if again is None or again.share < LOST * refined.share:
             break
         if again.share < WORSE * refined.share:  # there is more of it, but of less use to measure it by
             refined = replace(refined, cylinder=longer)

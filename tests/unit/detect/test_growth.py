@@ -30,5 +30,5 @@ def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[fl
 
 def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[View], empty_views: list[View]) -> None:
     for views in (pipe_views, empty_views):
-        same = grown(PIPE, 0.9, views, [], np.zeros(len(views)), 0.5)
+        same = grown(PIPE, views, [], np.zeros(len(views)), 0.5)
         assert same.length == pytest.approx(PIPE.length, abs=1e-9)
