@@ -42,8 +42,9 @@ COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
 MIN_STATIONS = 20
 # A pipe of which a piece is known is followed so many times, each time as far again.
 MAX_GROWTH = 4
-# Where more of it has so much less support, radius and axis are taken from what was known before.
-WORSE = 0.9
+# Where more of it has so much less support, or another radius by so many standard deviations, what was known before
+# gives radius and axis.
+WORSE, SAME_RADIUS = 0.9, 3.0
 # ... and where it has less than half, it was something else.
 LOST = 0.5
 # Cylinders that are not there stay under 0.1 (see `support`); the stated sigma grows where little is seen.
@@ -129,7 +130,10 @@ def refine(
         again = _fine(longer, (views, others, turned), blur, weaker, np.zeros(5))
         if again is None or again.share < LOST * refined.share:
             break
-        if again.share < WORSE * refined.share:  # there is more of it, but of less use to measure it by
+        changed = abs(again.cylinder.radius - refined.cylinder.radius)
+        sigma = np.sqrt(refined.solution.covariance[4, 4] + (MODEL_ERROR / np.median(refined.at.gain)) ** 2)
+        # There may be more of it that is of less use to measure it by.
+        if again.share < WORSE * refined.share or changed > SAME_RADIUS * sigma:
             refined = replace(refined, cylinder=longer)
             break
         refined, basis = again, turned

@@ -102,7 +102,7 @@ class Jury:
                 fit = self._as_planned(fit, others)
             if fit is None:
                 measured = Measured(candidate, candidate.cylinder, candidate.radius_sigma)
-            elif _contradict(candidate, fit):
+            elif not self._is_planned(fit) and _contradict(candidate, fit):
                 measured = Measured(candidate, *_by_the_cloud(candidate, fit))
             else:
                 measured = Measured(candidate, fit.cylinder, fit.radius_sigma)
