@@ -6,13 +6,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks.recordings import ROOT
 from benchmarks.survey import RESULTS
+
+Survey = dict[str, Any]
 
 BEGIN, END = "<!-- figures: written by benchmarks.document -->", "<!-- end of figures -->"
 WORTH_TELLING_MM = 1.0  # a radius further off is named with its pipe
@@ -45,15 +47,15 @@ def main() -> None:
     readme.write_text(with_table(readme.read_text(), results))
 
 
-def read_results() -> dict[str, dict[str, Any]]:
+def read_results() -> dict[str, Survey]:
     """The JSON files by name, in the order of their names."""
     return {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
 
 
-def accuracy(results: dict[str, dict[str, Any]]) -> str:
+def accuracy(results: dict[str, Survey]) -> str:
     """The text of docs/accuracy.md."""
     surveys = _surveys(results)
-    parts = [HEAD, "## Recordings through the graph\n", _survey_table(surveys)]
+    parts = [HEAD, "## Recordings through the graph\n", _survey_table(surveys, list(COLUMNS))]
     parts += ["What the recordings are, and the commands:\n", _list(_commands(surveys))]
     parts += ["What fell short:\n", _list(_shortfalls(surveys))]
     for name, result in results.items():
@@ -64,64 +66,58 @@ def accuracy(results: dict[str, dict[str, Any]]) -> str:
     return "\n".join(parts)
 
 
-def with_table(readme: str, results: dict[str, dict[str, Any]]) -> str:
+def with_table(readme: str, results: dict[str, Survey]) -> str:
     """The README with its table of figures brought up to date."""
     before, rest = readme.split(BEGIN)
     after = rest.split(END)[1]
-    return f"{before}{BEGIN}\n\n{_survey_table(_surveys(results))}\n{END}{after}"
+    return f"{before}{BEGIN}\n\n{_survey_table(_surveys(results), BRIEF)}\n{END}{after}"
 
 
-def _surveys(results: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _surveys(results: dict[str, Survey]) -> dict[str, Survey]:
     return {name.removeprefix("survey_"): result for name, result in results.items() if name.startswith("survey_")}
 
 
-def _survey_table(surveys: dict[str, dict[str, Any]]) -> str:
-    head = (
-        "recording",
-        "right class",
-        "false: planned / all",
-        "F",
-        "radius RMSE",
-        "length error",
-        "scale error",
-        "cameras, rigid",
-        "chi2 of radius",
-        "wall / CPU time",
-    )
-    rows = []
-    for name, survey in surveys.items():
-        score = survey["score"]
-        false = [str(score[kind]["false_positives"]) for kind in ("planned", "detection")]
-        rows.append(
-            (
-                f"`{name}`",
-                f"{score['classification']['true_positives']} of {len(score['pipes']) + len(score['missed'])}",
-                " / ".join(false),
-                f"{score['classification']['f_measure']:.3f}",
-                f"{score['radius']['rmse_mm']:.2f} mm",
-                f"{score['length']['mean_error_percent']:.2f} %",
-                f"{score['scale']['error_percent']:+.4f} %",
-                f"{score['trajectory']['rms_rigid_mm']:.2f} mm",
-                f"{_chi_square(survey):.2f}",
-                f"{survey['wall_s']:.0f} / {survey['cpu_s']:.0f} s",
-            )
-        )
-    return _table(head, rows)
+def _false(survey: Survey) -> str:
+    return " / ".join(str(survey["score"][kind]["false_positives"]) for kind in ("planned", "detection"))
 
 
-def _chi_square(survey: dict[str, Any]) -> float:
+def _right(survey: Survey) -> str:
+    score = survey["score"]
+    return f"{score['classification']['true_positives']} of {len(score['pipes']) + len(score['missed'])}"
+
+
+def _chi_square(survey: Survey) -> float:
     """Mean square of radius errors over their stated sigmas: 1 where the sigmas are true."""
     pipes, sigmas = survey["score"]["pipes"], survey["radius_sigmas"]
     return float(np.mean([(1e-3 * pipe["radius_error_mm"] / sigmas[pipe["id"]]) ** 2 for pipe in pipes]))
 
 
-def _commands(surveys: dict[str, dict[str, Any]]) -> Iterable[str]:
+COLUMNS: dict[str, Callable[[Survey], str]] = {
+    "right class": _right,
+    "false: planned / all": _false,
+    "F": lambda survey: f"{survey['score']['classification']['f_measure']:.3f}",
+    "radius RMSE": lambda survey: f"{survey['score']['radius']['rmse_mm']:.2f} mm",
+    "length error": lambda survey: f"{survey['score']['length']['mean_error_percent']:.2f} %",
+    "scale error": lambda survey: f"{survey['score']['scale']['error_percent']:+.4f} %",
+    "cameras, rigid": lambda survey: f"{survey['score']['trajectory']['rms_rigid_mm']:.2f} mm",
+    "chi2 of radius": lambda survey: f"{_chi_square(survey):.2f}",
+    "wall / CPU time": lambda survey: f"{survey['wall_s']:.0f} / {survey['cpu_s']:.0f} s",
+}
+BRIEF = ("right class", "false: planned / all", "radius RMSE", "length error", "scale error", "wall / CPU time")
+
+
+def _survey_table(surveys: dict[str, Survey], columns: Sequence[str]) -> str:
+    rows = [[f"`{name}`", *(COLUMNS[column](survey) for column in columns)] for name, survey in surveys.items()]
+    return _table(["recording", *columns], rows)
+
+
+def _commands(surveys: dict[str, Survey]) -> Iterable[str]:
     for name, survey in surveys.items():
         made = f"`{survey['made_by']}`; " if survey["made_by"] else ""
         yield f"`{name}`: {made}`{survey['command']}` at commit {survey['commit']}"
 
 
-def _shortfalls(surveys: dict[str, dict[str, Any]]) -> Iterable[str]:
+def _shortfalls(surveys: dict[str, Survey]) -> Iterable[str]:
     """Every miss, every false detection and every pipe that is far off, in words."""
     for name, survey in surveys.items():
         score = survey["score"]

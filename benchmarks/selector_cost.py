@@ -13,6 +13,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -66,7 +67,7 @@ def _measure(name: str, frames: Encoded, camera: Camera) -> dict[str, str | floa
         selector = FrameSelector(FramesConfig(), camera)
         decisions = []
         for stamp, encoded in frames:
-            decisions += selector.consider(stamp, lambda encoded=encoded: decode_reduced(encoded, camera.width))
+            decisions += selector.consider(stamp, partial(decode_reduced, encoded, camera.width))
         chosen = sum(decision.chosen for decision in decisions + selector.flush())
 
     def decode() -> None:
