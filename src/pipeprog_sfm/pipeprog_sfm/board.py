@@ -258,16 +258,27 @@ def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) 
     best = np.sort(np.argsort(ellipses.rms, kind="stable")[:MAX_CANDIDATES])
     free = np.zeros(len(ellipses), bool)
     free[best] = True
-    matrix, found = camera.matrix, []
+    matrix, found, least = camera.matrix, [], []
+
+    def take(board: Board, pose: FloatArray, circles: NDArray[np.intp], members: NDArray[np.intp]) -> None:
+        free[members] = False
+        found.append(_observation(ellipses, board, matrix, *_upright(board, pose, circles), members))
+
     for board in (group[0] for group in layouts(boards)):
         for circles, members in islice(_hypotheses(ellipses, free, board, matrix), MAX_TRIALS):
             if not free[members].all():
                 continue
             fit = _verify(ellipses, free, board, camera, circles, members)
-            if fit is not None:
-                pose, circles, members = fit
-                free[members] = False
-                found.append(_observation(ellipses, board, matrix, *_upright(board, pose, circles), members))
+            if fit is None:
+                continue
+            if len(fit[1]) > LEAST_CIRCLES:
+                take(board, *fit)
+            else:
+                least.append((board, fit))
+    # Three circles may fit by chance: they must not take an ellipse from a board of which more is seen.
+    for board, fit in least:
+        if free[fit[2]].all():
+            take(board, *fit)
     return found
 
 

@@ -2,7 +2,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from targets import BOARD, CAMERA, LOPSIDED, camera_from_board, exact_ellipses, render
 
@@ -160,13 +160,14 @@ def test_no_ellipses_in_flat_and_noisy_images():
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(-1.2, 1.2), st.floats(-0.7, 0.7), st.floats(1.0, 2.5), st.floats(-0.6, 0.6), st.integers(0, 2**16))
+@example(1.1875, 0.25, 2.0, 0.0, 2944)  # three ellipses look like the other board, two of them circles of this one
 def test_identity_from_geometry_in_clutter(x, y, z, roll, seed):
     rng = np.random.default_rng(seed)
     pose = camera_from_board((x, y, z), (0, 0, 0), roll)
     true = exact_ellipses([LOPSIDED], [pose], noise=0.05, rng=rng)
     found = identify(joined(clutter(rng, 25), true), [BOARD, LOPSIDED], CAMERA)
     # Three of 25 small ellipses look like a board in one image of fifty; the other images tell (test_scale).
-    assert {one.board for one in found if len(one.indices) > 3} <= {"B"}
+    assert {one.board for one in found if len(one.indices) > 3} == {"B"}
     board = next(one for one in found if one.board == "B")
     assert board.centres == pytest.approx(images_of_centres(LOPSIDED, pose)[board.indices], abs=0.5)
 
