@@ -167,6 +167,8 @@ class McapFile:
         if len(name) < name_length or len(stream.read(8)) < 8:
             return
         offset = position + 9 + 40 + name_length
+        if offset > end:  # a length of zeros that never reached the disk
+            return
         self._blocks.append(
             _Block(offset, start, end - offset, name.decode("ascii", "replace"), uncompressed_size, crc, whole)
         )
