@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import minimize_scalar
 
 from pipeprog_detect.pipe import FloatArray
 from pipeprog_detect.section import components, confocal_distance, find_ellipses
@@ -26,14 +25,10 @@ def test_the_confocal_distance_is_the_distance(aspect: float, turn: float, place
     foot = on_ellipse(np.array([place]), ellipse)[0]
     radial = foot - ellipse[:2]
     point = foot + off * radial / np.linalg.norm(radial)
-    nearest = minimize_scalar(
-        lambda s: float(np.linalg.norm(on_ellipse(np.array([place + s]), ellipse)[0] - point)),
-        bounds=(-0.3, 0.3),
-        method="bounded",
-        options={"xatol": 1e-10},
-    )
+    # A search may end in a local minimum at the tip of a long ellipse; a grid does not.
+    nearest = np.linalg.norm(on_ellipse(place + np.linspace(-0.5, 0.5, 20001), ellipse) - point, axis=1).min()
     distance = confocal_distance(point[None], ellipse)[0]
-    assert abs(distance) == pytest.approx(nearest.fun, abs=0.01)
+    assert abs(distance) == pytest.approx(nearest, abs=0.01)
     assert distance * off >= -1e-12
 
 
