@@ -72,7 +72,7 @@ class Jury:
         """
         if any(_alike(candidate.cylinder, refused) for refused in self._refused):
             return False
-        fit = self._refined(candidate, [], self._few, follow=False)
+        fit = self._as_planned(self._refined(candidate, [], self._few, follow=False), [])
         if fit is None or fit.support < CONVINCING or not self._is_planned(fit):
             self._refused.append(candidate.cylinder)
             return False
