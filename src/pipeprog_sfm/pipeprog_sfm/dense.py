@@ -55,9 +55,9 @@ class DenseMapper:
 
     def __init__(self, stereo: StereoConfig, fusion: FusionConfig) -> None:
         self._stereo_config, self._fusion_config = stereo, fusion
-        # On a straight walk a point is in sight of 1 / (1 - overlap) depth maps, twice as many as must agree on it: to
-        # the other half it may be hidden, slanting or blurred.
-        self._overlap = 1.0 - 1.0 / (2 * fusion.min_views)
+        # On a straight walk a point is in sight of 1 / (1 - overlap) depth maps, four times as many as must agree on
+        # it: to the others it may be hidden, slanting, blurred, or too thin to be matched.
+        self._overlap = 1.0 - 1.0 / (4 * fusion.min_views)
         self._image = lru_cache(maxsize=IMAGE_CACHE)(_decode)
         self._depths: dict[int, Future[_Depth]] = {}
         self._waiting: deque[Callable[[], None]] = deque()
