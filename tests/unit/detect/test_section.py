@@ -26,7 +26,8 @@ def test_the_confocal_distance_is_the_distance(aspect: float, turn: float, place
     radial = foot - ellipse[:2]
     point = foot + off * radial / np.linalg.norm(radial)
     # A search may end in a local minimum at the tip of a long ellipse; a grid does not.
-    nearest = np.linalg.norm(on_ellipse(place + np.linspace(-0.5, 0.5, 20001), ellipse) - point, axis=1).min()
+    angles = np.asarray(place + np.linspace(-0.5, 0.5, 20001), float)
+    nearest = np.linalg.norm(on_ellipse(angles, ellipse) - point, axis=1).min()
     distance = confocal_distance(point[None], ellipse)[0]
     assert abs(distance) == pytest.approx(nearest, abs=0.01)
     assert distance * off >= -1e-12
