@@ -16,6 +16,9 @@ BOUNDS = yaml.safe_load((Path(__file__).parent / "bounds.yaml").read_text())
 # The demo, and two more layouts at the size of a robot's camera.
 RECORDINGS = (DEMO, site("lab", 21, "--size=480p"), site("lab", 22, "--size=480p"))
 
+# Every lab has five pipes wider than this [m], and one of 8.6 mm.
+WIDE, WIDE_PIPES = 0.03, 5
+
 
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
@@ -31,6 +34,7 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
     )
     return {
         "f_measure": 2 * true / (2 * true + false + missed),
+        "wide_pipes_found": sum(pipe["true_radius"] > WIDE for pipe in pipes) / (WIDE_PIPES * len(RECORDINGS)),
         "right_class": sum(score["classification"]["true_positives"] for score in scores) / true,
         "radius_rmse_mm": float(np.sqrt(np.mean(radius_errors**2))),
         "radius_worst_mm": float(np.abs(radius_errors).max()),

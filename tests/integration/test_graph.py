@@ -79,14 +79,14 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
     assert len(considered) == 16
 
     result = json.loads((one / "pipes.json").read_text())
-    assert result.keys() >= {"frame_id", "scale", "pipes", "classes"}
+    assert result.keys() == {"frame_id", "scale", "pipes", "classes", "runs"}
     assert result["frame_id"] == "map"
     assert result["scale"]["source"] == "board"
     assert 0 < result["scale"]["sigma"] < 0.01
     for pipe in result["pipes"]:
-        assert pipe.keys() >= {
+        assert pipe.keys() == {
             *("id", "start", "end", "radius", "radius_sigma", "length"),
-            *("class", "class_probability", "visible_arc_deg", "rmse", "points"),
+            *("class", "class_probability", "class_kmeans", "ambiguous", "visible_arc_deg", "rmse", "points"),
         }
         # Each coordinate and the length are rounded to the micrometre.
         assert pipe["length"] == pytest.approx(np.linalg.norm(np.subtract(pipe["end"], pipe["start"])), abs=3e-6)

@@ -87,10 +87,6 @@ class Graph:
             process.wait()
         self._processes.clear()
 
-    def pids(self) -> dict[str, int]:
-        """Process number of each node."""
-        return {name: process.pid for name, process in self._processes.items()}
-
     def _start(self, name: str) -> None:
         parameters = {key: value for key, value in self._parameters.get(name, {}).items() if value is not None}
         file = self._folder / f"{name}.yaml"

@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from pipeprog_detect.octree import THREADS, IntArray, Octree, neighbour_runs
 from pipeprog_detect.pipe import FloatArray
@@ -272,8 +271,3 @@ def _patch_residuals(points: FloatArray, first: IntArray, last: IntArray, scale:
         if share > 0.8:
             out[c] = rms * np.sqrt(len(near) / max(len(near) - 6.0, 1.0))
     return out
-
-
-def is_flat(shape: Surfaces, sigma: float) -> NDArray[np.bool_]:
-    """Which sites (S,) lie on a surface that is flat within the noise over its scale."""
-    return (shape.count > 0) & (np.abs(shape.curvature) < np.maximum(3.0 * shape.sigma, 0.02 / shape.scale))
