@@ -97,6 +97,7 @@ def make_site(
     robot: Annotated[bool, typer.Option(help="also what a robot tells: /odom, /imu and /tf_static")] = False,
     odometry_error: Annotated[float, typer.Option(help="percent by which odometry's lengths are off")] = 0.0,
     surface: Annotated[bool, typer.Option(help="also NAME.surface.npz: true surface points and their pipes")] = False,
+    board_error_mm: Annotated[float, typer.Option(help="standard deviation of a printed circle's place", min=0)] = 0.0,
     allow_hidden: Annotated[bool, typer.Option(help="accept a recording that does not show every pipe")] = False,
     jobs: Annotated[int, typer.Option(help="frames rendered at a time", min=1)] = 1,
 ) -> None:
@@ -113,7 +114,7 @@ def make_site(
     rng = np.random.default_rng(seed)
     build = build_lab if layout == Layout.lab else build_field
     try:
-        site = build(rng, richness, tiled, distance)
+        site = build(rng, richness, tiled, distance, board_error_mm / 1e3)
     except RuntimeError as error:
         console.print(f"error: {error}")
         raise typer.Exit(1) from None

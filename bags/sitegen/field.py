@@ -133,7 +133,7 @@ def _shell(room: _Room) -> None:
     room.keep_clear.append((np.array([6.51, -0.37, 0.0]), np.array([6.81, -0.07, 2.3])))
     for x in (0.62, 9.0):
         centre = np.array([x + room.uniform(-0.1, 0.1), 0.0, 2.09 + room.uniform(-0.02, 0.02)])
-        site.board(centre, (0, -1, 0))
+        site.board(centre, (0, -1, 0), room.rng.spawn(1)[0])
         # Nothing may stand between a board and the path.
         room.block(centre - np.array([0.34, 1.7, 0.34]), centre + np.array([0.34, 0.0, 0.23]))
 
@@ -267,10 +267,12 @@ def _waypoints(distance: float) -> list[list[float]]:
     return path
 
 
-def build_field(rng: np.random.Generator, richness: float, wall_period: float, distance: float) -> Site:
+def build_field(
+    rng: np.random.Generator, richness: float, wall_period: float, distance: float, board_error: float = 0.0
+) -> Site:
     """Back wall y = 0 with everything before it (y < 0), floor z = 0; raises RuntimeError where no layout is seen."""
     for _ in range(_LAYOUTS):
-        site = Site(FIELD_RADII, richness, wall_period)
+        site = Site(FIELD_RADII, richness, wall_period, board_error)
         room = _Room(site, rng)
         _shell(room)
         _racks(room)

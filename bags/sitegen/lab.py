@@ -27,9 +27,11 @@ def _material(radius: float, rng: np.random.Generator) -> Material:
     return COPPER if radius < 0.02 else PIPE_MATERIALS[int(rng.integers(len(PIPE_MATERIALS)))]
 
 
-def build_lab(rng: np.random.Generator, richness: float, wall_period: float, distance: float) -> Site:
+def build_lab(
+    rng: np.random.Generator, richness: float, wall_period: float, distance: float, board_error: float = 0.0
+) -> Site:
     """Wall y = 0 with the pipes before it (y < 0), side wall x = 0, floor z = 0; seen from about y = -distance."""
-    site = Site(LAB_RADII, richness, wall_period)
+    site = Site(LAB_RADII, richness, wall_period, board_error)
     site.wall((_WIDTH / 2, 0.0, _HEIGHT / 2), (0, -1, 0), _WIDTH, _HEIGHT, CONCRETE)
     site.wall((0.0, -_DEPTH / 2, _HEIGHT / 2), (1, 0, 0), _DEPTH, _HEIGHT, PLASTER)
     site.wall((_WIDTH / 2, -_DEPTH / 2, 0.0), (0, 0, 1), _WIDTH, _DEPTH, SCREED)
@@ -74,7 +76,7 @@ def build_lab(rng: np.random.Generator, richness: float, wall_period: float, dis
             site.clamp(pipe, share * length, (0, 1, 0), -y)
 
     centre = left + rng.uniform(0.4, 1.0)
-    site.board((centre, 0.0, rng.uniform(2.07, 2.15)), (0, -1, 0))
+    site.board((centre, 0.0, rng.uniform(2.07, 2.15)), (0, -1, 0), rng.spawn(1)[0])
     site.box((left - 0.1, -0.24, 2.50), (_WIDTH - 0.2, -0.03, 2.72), GALVANISED)
 
     lamp = rng.uniform(-0.4, 0.4)

@@ -84,6 +84,7 @@ class Site:
     planned_radii: tuple[float, ...]
     richness: float = 1.0
     wall_period: float = 0.0
+    board_error: float = 0.0  # m, standard deviation of a printed circle's place, along and across
     primitives: list[Primitive] = field(default_factory=list)
     pipes: list[Pipe] = field(default_factory=list)
     ignored: list[tuple[FloatArray, FloatArray, float]] = field(default_factory=list)
@@ -150,8 +151,11 @@ class Site:
         centre = p.start + at * axis
         self.decoy(centre - 0.02 * axis, centre + 0.02 * axis, 1.6 * p.radius, GALVANISED)
 
-    def board(self, centre: ArrayLike, normal: ArrayLike) -> None:
-        """A board of five white circles, its back at `centre` on a surface with that (horizontal) normal."""
+    def board(self, centre: ArrayLike, normal: ArrayLike, printing: np.random.Generator) -> None:
+        """A board of five white circles, its back at `centre` on a surface with that (horizontal) normal.
+
+        It is printed as well as the site's boards are; what is kept as true is what was printed.
+        """
         n = unit(normal)
         rotation = shapes.frame(n)
         right, up = rotation[0], rotation[1]
@@ -161,7 +165,8 @@ class Site:
             Primitive(shapes.Kind.BOX, middle, rotation, (*_BOARD_HALF, _BOARD_THICKNESS / 2), self.dressed(BLACK))
         )
         face = back + n * (_BOARD_THICKNESS + _PAINT_THICKNESS)
-        circles = np.array([face + x * right + y * up for x, y in BOARD_CENTRES])
+        printed = np.array(BOARD_CENTRES) + self.board_error * printing.standard_normal((len(BOARD_CENTRES), 2))
+        circles = np.array([face + x * right + y * up for x, y in printed])
         for circle in circles:
             self.add(shapes.disc(circle, n, BOARD_CIRCLE_RADIUS, self.dressed(WHITE)))
         self.boards.append(circles)

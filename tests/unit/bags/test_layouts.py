@@ -61,6 +61,19 @@ def test_boards_face_the_room_with_their_first_circle_up_left() -> None:
     assert np.allclose(flat, BOARD_CENTRES, atol=1e-12)
 
 
+def test_boards_are_printed_as_badly_as_asked_and_nothing_else_moves() -> None:
+    error = 1e-3
+    exact = lab(1)
+    printed = [build_lab(np.random.default_rng(seed), 1.0, 0.0, 2.0, error) for seed in (1, 1, 2)]
+    offsets = [site.boards[0] - lab(seed).boards[0] for site, seed in zip(printed, (1, 1, 2), strict=True)]
+    assert np.array_equal(offsets[0], offsets[1])
+    assert not np.allclose(offsets[0], offsets[2])
+    assert not offsets[0][:, 1].any(), "circles stay on the board's face"
+    assert 0.5 * error < np.concatenate(offsets)[:, [0, 2]].std() < 1.5 * error
+    assert np.array_equal(printed[0].pipes[-1].start, exact.pipes[-1].start)
+    assert printed[0].lamps == exact.lamps
+
+
 def test_a_bill_plans_a_quarter_more_than_is_there() -> None:
     site = lab(1)
     planned = site.planned_lengths()
