@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,6 +38,8 @@ ALIKE = 3  # of these that are matched in full
 GLANCE = 400  # features that such a comparison takes
 RETRIES = 3  # waiting keyframes tried again with each new one
 START_CANDIDATES = 8  # waiting keyframes that a new one may start a model with
+REMEMBERED = 100  # retired keyframes whose features are kept for when they are called for again: 60 MB
+PAIRS_REMEMBERED = 2000  # of keyframes, whose matches are kept: 10 MB
 ERROR_SAMPLE = 20_000  # observations whose mean error is told: a hundredth of a pixel exact
 GRID = (32, 18)
 NO_STAMP = -1
@@ -102,6 +105,8 @@ class Mapper:
         self._revision = 0
         self._cursor = 0
         self._tied: dict[int, tuple[int | None, int, int | None]] = {}
+        self._retired: dict[int, _Keyframe] = {}
+        self._matches: dict[tuple[int, int, int], MatchArray] = {}
 
     @property
     def seen(self) -> int:
@@ -144,14 +149,16 @@ class Mapper:
         return chosen or max(self._models, key=len)
 
     def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera) -> KeyframeReport:
-        """Takes a keyframe: (H, W) uint8 as the camera saw it, stamp in ns."""
-        return self.add_features(stamp, extract(gray, camera, self._config), camera)
+        """Takes a keyframe: (H, W) uint8 as the camera saw it, stamp in ns. One that was retired is known already."""
+        known = self._retired.pop(stamp, None)
+        return self._add(known or _keyframe(stamp, extract(gray, camera, self._config), camera))
 
     def add_features(self, stamp: int, features: Features, camera: Camera) -> KeyframeReport:
         """Takes a keyframe whose features are known."""
-        rays = (features.keypoints - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-        hull, cells = _hull(features.keypoints), _cells(features.keypoints, (camera.width, camera.height))
-        keyframe = _Keyframe(stamp, features, camera, rays, np.array([camera.fx, camera.fy]), hull, cells)
+        return self._add(_keyframe(stamp, features, camera))
+
+    def _add(self, keyframe: _Keyframe) -> KeyframeReport:
+        stamp = keyframe.stamp
         self._keyframes[stamp] = keyframe
         report = self._register_anywhere(keyframe)
         if not report.registered:
@@ -164,13 +171,17 @@ class Mapper:
         return self._report(stamp)
 
     def retire(self, stamps: Collection[int]) -> None:
-        """Takes keyframes back as if they had never come: pose, features and observations; unknown stamps are ignored.
+        """Takes keyframes out of the map: pose and observations; unknown stamps are ignored.
 
+        The features and matches of the last ones are kept for when they come again.
         A point that fewer than two others see goes with them. A view that is left alone in its model waits again.
         """
         for stamp in stamps:
-            if self._keyframes.pop(stamp, None) is None:
+            keyframe = self._keyframes.pop(stamp, None)
+            if keyframe is None:
                 continue
+            self._retired[stamp] = keyframe
+            _forget_oldest(self._retired, REMEMBERED)
             self._tied.pop(stamp, None)
             model = self._model_of(stamp)
             if model is None:
@@ -312,20 +323,24 @@ class Mapper:
         count = min(RETRIEVED, len(model))
         views = (self._cursor + np.arange(count) * max(len(model) // RETRIEVED, 1)) % len(model)
         self._cursor += 1
-        descriptors = keyframe.features.descriptors[:GLANCE]
-        found = [len(match(descriptors, self._features(model, int(view)).descriptors[:GLANCE])) for view in views]
+        found = [len(self._matched(keyframe, self._keyframes[model.stamps[view]], GLANCE)) for view in views]
         order = np.argsort(-np.array(found), kind="stable")[:ALIKE]
         return views[order][np.array(found)[order] > 0]
 
-    def _features(self, model: SparseModel, view: int) -> Features:
-        return self._keyframes[model.stamps[view]].features
+    def _matched(self, keyframe: _Keyframe, other: _Keyframe, count: int) -> MatchArray:
+        """Matches of the `count` strongest features of two keyframes, found once."""
+        pair = keyframe.stamp, other.stamp, count
+        if pair not in self._matches:
+            self._matches[pair] = match(keyframe.features.descriptors[:count], other.features.descriptors[:count])
+            _forget_oldest(self._matches, PAIRS_REMEMBERED)
+        return self._matches[pair]
 
     def _locate(self, model: SparseModel, keyframe: _Keyframe, anchors: IntArray, count: int) -> _Location:
         """Pose by the map points that the anchors see, from the `count` strongest features."""
         evidence = {}
         pairs = []
         for view in anchors:
-            found = match(keyframe.features.descriptors[:count], self._features(model, view).descriptors[:count])
+            found = self._matched(keyframe, self._keyframes[model.stamps[view]], count)
             evidence[model.stamps[view]] = found
             pairs.append(np.stack([found[:, 0], model.point_of[model.offsets[view] + found[:, 1]]], axis=1))
         known = np.concatenate(pairs)
@@ -468,7 +483,7 @@ class Mapper:
         return True
 
     def _pair(self, first: _Keyframe, second: _Keyframe) -> SparseModel | None:
-        found = match(first.features.descriptors[:COARSE], second.features.descriptors[:COARSE])
+        found = self._matched(first, second, COARSE)
         if len(found) < START_POINTS:
             return None
         pixels, other_pixels = first.features.keypoints[found[:, 0]], second.features.keypoints[found[:, 1]]
@@ -564,6 +579,17 @@ class Mapper:
                 self._drop(model, view)
         model.adjusted_at = len(model)
         self._revision += 1
+
+
+def _keyframe(stamp: int, features: Features, camera: Camera) -> _Keyframe:
+    rays = (features.keypoints - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    hull, cells = _hull(features.keypoints), _cells(features.keypoints, (camera.width, camera.height))
+    return _Keyframe(stamp, features, camera, rays, np.array([camera.fx, camera.fy]), hull, cells)
+
+
+def _forget_oldest(known: dict[Any, Any], limit: int) -> None:
+    while len(known) > limit:
+        del known[next(iter(known))]
 
 
 def _poses(model: SparseModel) -> dict[int, FloatArray]:

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import pipeprog_sfm.mapper as mapper_module
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features import Features, root_sift
 from pipeprog_sfm.mapper import Mapper
+from pipeprog_sfm.matching import match
 
 CAMERA = Camera(1280, 720, 900.0, 900.0, 639.5, 359.5)
 NOISE = 0.3  # px
@@ -212,3 +214,43 @@ def test_a_model_whose_keyframes_are_retired_is_given_up() -> None:
     assert (mapper.seen, mapper.models, mapper.waiting) == (1, 0, 1)
     assert mapper.add_features(3 * STEP, view(pose(0.6), 3), CAMERA).registered
     assert (mapper.models, mapper.registered) == (1, 2)
+
+
+def test_a_keyframe_that_comes_again_is_neither_searched_nor_matched_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    extracted, matched = [], []
+
+    def counted_extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Features:
+        number = int(gray[0, 0])
+        extracted.append(number)
+        return view(pose(0.2 * number), number)
+
+    def counted_match(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int32]:
+        matched.append(len(a))
+        return match(a, b)
+
+    monkeypatch.setattr(mapper_module, "extract", counted_extract)
+    monkeypatch.setattr(mapper_module, "match", counted_match)
+    mapper = Mapper(MapperConfig())
+    for n in range(6):
+        mapper.add(n * STEP, np.full((2, 2), n, np.uint8), CAMERA)
+    first = dict(mapper.camera_from_model())
+    mapper.retire([3 * STEP])
+    matches_before = len(matched)
+    assert mapper.add(3 * STEP, np.full((2, 2), 3, np.uint8), CAMERA).registered
+    assert extracted == [0, 1, 2, 3, 4, 5]
+    # Its neighbour of before is known; the one that has come since is not.
+    assert len(matched) - matches_before == 1
+    np.testing.assert_allclose(centre(mapper.camera_from_model()[3 * STEP]), centre(first[3 * STEP]), atol=0.01)
+
+
+def test_what_is_remembered_of_retired_keyframes_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mapper_module, "REMEMBERED", 2)
+    mapper = Mapper(MapperConfig())
+    monkeypatch.setattr(mapper_module, "extract", lambda gray, camera, config: pytest.fail("searched again"))
+    for n in range(5):
+        mapper.add_features(n * STEP, view(pose(0.2 * n), n), CAMERA)
+    mapper.retire([n * STEP for n in range(5)])
+    for n in (3, 4):
+        mapper.add(n * STEP, np.zeros((2, 2), np.uint8), CAMERA)
+    with pytest.raises(pytest.fail.Exception, match="searched again"):
+        mapper.add(2 * STEP, np.zeros((2, 2), np.uint8), CAMERA)
