@@ -25,10 +25,10 @@ from benchmarks.survey import RESULTS, RUNS, survey
 from pipeprog_bringup.bag import Bag
 from pipeprog_bringup.results import read_trajectory
 from pipeprog_bringup.score import score_files
-from pipeprog_sfm.board import load_boards
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.scale import NoScaleError
+from pipeprog_sfm.target_file import load_targets
 
 CHOICES = 50  # as in the paper
 VIEWS = (2, 3, 4, 5, 6, 8, 10, 15, 20, 25, 30, 35)  # the paper's range
@@ -75,7 +75,7 @@ def _tracked(run: Path, board: Path, corrected: bool) -> tuple[BoardTracker, dic
     """The boards in the keyframes of a run, and the poses camera_from_map, by stamp, of those that see one."""
     bag = Bag.open(run / "out.mcap")
     config = dataclasses.replace(SfmConfig().board, eccentricity=corrected)
-    tracker = BoardTracker(load_boards(board), config)
+    tracker = BoardTracker(load_targets(board), config)
     seeing = set()
     for frame in bag:
         encoded = np.frombuffer(deserialize_message(frame.data, CompressedImage).data, np.uint8)

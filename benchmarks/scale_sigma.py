@@ -23,12 +23,12 @@ from sensor_msgs.msg import CompressedImage
 from benchmarks.recordings import Recording, made, site
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
-from pipeprog_sfm.board import load_boards
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import Mapper
 from pipeprog_sfm.placement import similarity
 from pipeprog_sfm.scale import ScaleEstimate
+from pipeprog_sfm.target_file import load_targets
 
 FIRST_SEED = 201
 OPTIONS = ("--size=480p", "--seconds=5", "--fps=3", "--allow-hidden")
@@ -54,7 +54,11 @@ def main(seeds: int) -> None:
         )
         print(rows[-1], flush=True)
     ratios = np.array([row["error over sigma"] for row in rows])
-    facts = {"within_3_sigma": int((np.abs(ratios) < 3).sum()), "of": seeds, "chi2": round(float((ratios**2).mean()), 2)}
+    facts = {
+        "within_3_sigma": int((np.abs(ratios) < 3).sum()),
+        "of": seeds,
+        "chi2": round(float((ratios**2).mean()), 2),
+    }
     print(facts)
     title = f"Stated sigma of the scale: {facts['within_3_sigma']} of {seeds} within 3 sigma, chi2 {facts['chi2']}"
     command = f"python -m benchmarks.scale_sigma {seeds}"
@@ -66,7 +70,7 @@ def main(seeds: int) -> None:
 def measure(recording: Recording, config: SfmConfig) -> tuple[ScaleEstimate, float, int]:
     """The estimate, its true relative error, and the number of images registered."""
     bag = Bag.open(recording.bag)
-    mapper, tracker = Mapper(config.mapper), BoardTracker(load_boards(recording.beside("board.yaml")), config.board)
+    mapper, tracker = Mapper(config.mapper), BoardTracker(load_targets(recording.beside("board.yaml")), config.board)
     stamps = []
     for frame in bag:
         gray = decoded(frame.data)

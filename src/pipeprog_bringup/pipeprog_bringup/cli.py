@@ -144,12 +144,13 @@ def board(
     out: Annotated[Path, typer.Option("--out", help="The file to write.", metavar="BOARD.pdf")],
     force: Annotated[bool, typer.Option("--force", help="Replace the file that --out names.")] = False,
 ) -> None:
-    """Write target boards to print at true size, each with a ruler to check the print."""
+    """Write target boards and marks to print at true size, each with a ruler to check the print."""
     from pipeprog_bringup.output import output_file
-    from pipeprog_sfm.board import load_boards
     from pipeprog_sfm.board_print import board_pdf
+    from pipeprog_sfm.target_file import load_targets
 
-    pages = load_boards(boards)
+    targets = load_targets(boards)
+    pages = [*targets.boards, *(disc for pair in targets.marks for disc in pair.discs)]
     document = board_pdf(pages, paper)
     with output_file(out, force) as file:
         file.write_bytes(document)

@@ -39,7 +39,7 @@ from pipeprog_detect.classify import ClassProgress
 from pipeprog_detect.pipe import Cylinder, Pipe
 from pipeprog_msgs import msg, srv
 from pipeprog_node import messages, qos
-from pipeprog_sfm.board import load_boards
+from pipeprog_sfm.target_file import Targets, load_targets
 
 IN_FLIGHT = 8  # frames that the selector may not have decided on yet; above its window, or it would wait for ever
 START_SECONDS = 90.0  # until all nodes have found each other: imports of a cold disk included
@@ -126,7 +126,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
         request.bag, request.image_topic, request.camera_info_topic, request.odometry_topic, request.imu_topic
     )
     bill = load_bill(request.boq)
-    boards = load_boards(request.board) if request.board else []
+    targets = load_targets(request.board) if request.board else Targets()
     if request.rate is not None and not request.rate > 0:
         raise InputError(f"--rate {request.rate:g}: give a factor above zero, 1 for real time")
     if any(text.partition("=")[0].strip() == "frames.lockstep" for text in request.overrides):
@@ -155,7 +155,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             {
                 **{node: dataclasses.asdict(config) for node, config in configs.items()},
                 "boq": results.bill_entries(bill),
-                "boards": [board.name for board in boards],
+                "boards": [board.name for board in targets.boards],
                 "replay": {
                     "bag": str(request.bag),
                     "image_topic": bag.image_topic,

@@ -1,23 +1,18 @@
-"""Target boards: their files, and which ellipses of an image are which circles of which board."""
+"""Target boards, and which ellipses of an image are which circles of which board."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, islice
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.errors import InputError
 from pipeprog_sfm.conic import FloatArray, circle_centre_images, circles_from_conics, project_circles
 from pipeprog_sfm.ellipse import PROFILES, TargetEllipses
 
@@ -69,135 +64,6 @@ class BoardObservation:
     conics: FloatArray
     sigma: float
     camera_from_board: FloatArray
-
-
-@dataclass(frozen=True)
-class Distance:
-    """A measured distance between the centres of two circles.
-
-    Attributes:
-        name: for people.
-        ends: name of the board and row of Board.centres, twice.
-        length: m.
-        sigma: standard deviation of `length`, m.
-    """
-
-    name: str
-    ends: tuple[tuple[str, int], tuple[str, int]]
-    length: float
-    sigma: float
-
-
-def load_boards(path: str | Path) -> list[Board]:
-    """Boards of a BOARD.yaml file: `boards: [{name, circle_radius_mm, centres_mm: [[x, y], ...]}]`.
-
-    Raises:
-        InputError: the file cannot be read, a key is missing or unknown, text stands where a number belongs, a board
-            has fewer than three circles, circles that overlap or lie on one line, a layout that looks the same
-            turned by 120 degrees or less, or a name that is taken.
-    """
-    entries = _content(path)["boards"]
-    if not isinstance(entries, list) or not entries:
-        raise InputError(f"{path}: 'boards' must be a list with at least one board")
-    boards: list[Board] = []
-    for number, entry in enumerate(entries, 1):
-        board = _board(entry, f"{path}: board {number}")
-        if board.name in [other.name for other in boards]:
-            raise InputError(f"{path}: the name '{board.name}' is given to two boards: names must be unique")
-        boards.append(board)
-    return boards
-
-
-def load_distances(path: str | Path, boards: Sequence[Board]) -> list[Distance]:
-    """Distances of a BOARD.yaml file: `distances: [{from: A/1, to: B/3, distance_mm, sigma_mm}]`, none without the key.
-
-    `A/1` is the first circle of board A.
-
-    Raises:
-        InputError: as `load_boards`, or a board or circle is not in the file, or a number is not positive.
-    """
-    entries = _content(path).get("distances", [])
-    if not isinstance(entries, list):
-        raise InputError(f"{path}: 'distances' must be a list")
-    return [_distance(entry, f"{path}: distance {number}", boards) for number, entry in enumerate(entries, 1)]
-
-
-def _distance(value: Any, where: str, boards: Sequence[Board]) -> Distance:
-    entry = _entry(value, ("from", "to", "distance_mm", "sigma_mm"), where)
-    ends = []
-    for key in ("from", "to"):
-        name, _, number = str(entry[key]).rpartition("/")
-        count = next((len(board.centres) for board in boards if board.name == name), 0)
-        if not number.isdecimal() or not 1 <= int(number) <= count:
-            raise InputError(
-                f"{where}: '{key}: {entry[key]}' is no circle of the file: write BOARD/NUMBER, such as "
-                f"{boards[0].name}/1 for the first circle of board {boards[0].name}"
-            )
-        ends.append((name, int(number) - 1))
-    if ends[0] == ends[1]:
-        raise InputError(f"{where}: both ends are {entry['from']}")
-    length, sigma = (_number(entry[key], f"{where}: {key}") for key in ("distance_mm", "sigma_mm"))
-    if length <= 0 or sigma <= 0:
-        raise InputError(f"{where}: distance_mm and sigma_mm must be above zero")
-    return Distance(f"{entry['from']} to {entry['to']}", (ends[0], ends[1]), length / 1000, sigma / 1000)
-
-
-def _content(path: str | Path) -> Mapping[str, Any]:
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the board file cannot be read ({error})") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
-    return _entry(content, ("boards",), str(path), optional=("distances",))
-
-
-def _entry(value: Any, keys: Sequence[str], where: str, optional: Sequence[str] = ()) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise InputError(f"{where}: expected the keys {', '.join(keys)}, found {value!r}")
-    known = (*keys, *optional)
-    for key in value:
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, 1, 0.0)[0]
-            raise InputError(f"{where}: unknown key '{key}', did you mean '{near}'?")
-    for key in keys:
-        if key not in value:
-            raise InputError(f"{where}: the key '{key}' is missing")
-    return value
-
-
-def _board(value: Any, where: str) -> Board:
-    entry = _entry(value, ("name", "circle_radius_mm", "centres_mm"), where)
-    name = str(entry["name"])
-    where = f"{where} ('{name}')"
-    radius = _number(entry["circle_radius_mm"], f"{where}: circle_radius_mm")
-    if radius < 1.0:
-        raise InputError(f"{where}: circle_radius_mm = {radius:g} is too small: give millimetres, 1 or more")
-    rows = entry["centres_mm"]
-    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 2 for row in rows):
-        raise InputError(f"{where}: centres_mm must be a list of [x, y] pairs in millimetres")
-    if len(rows) < LEAST_CIRCLES:
-        raise InputError(f"{where}: {len(rows)} circles, but a board needs {LEAST_CIRCLES} or more")
-    flat = np.array([[_number(number, f"{where}: centres_mm") for number in row] for row in rows])
-    apart = np.linalg.norm(flat[:, None] - flat[None], axis=-1) + np.diag(np.full(len(flat), np.inf))
-    if apart.min() <= 2 * radius:
-        first, second = np.unravel_index(apart.argmin(), apart.shape)
-        raise InputError(f"{where}: circles {first + 1} and {second + 1} overlap ({apart.min():g} mm apart)")
-    if np.linalg.svd(flat - flat.mean(0), compute_uv=False)[1] < 2 * radius:
-        raise InputError(f"{where}: the circles lie on one line: move one aside, so that the board has a plane")
-    board = Board(name, radius / 1000, np.c_[flat, np.zeros(len(flat))] / 1000)
-    turns = len(symmetries(board))
-    if turns > 2:
-        raise InputError(
-            f"{where}: the layout looks the same {turns} ways round, and its circles cannot be told apart: move one"
-        )
-    return board
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f"{where}: {value!r} is not a number")
-    return float(value)
 
 
 def symmetries(board: Board) -> NDArray[np.intp]:

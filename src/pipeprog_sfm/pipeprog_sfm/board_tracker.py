@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.board import Board, BoardObservation, Distance, identify
+from pipeprog_sfm.board import BoardObservation, identify
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses, find_ellipses
 from pipeprog_sfm.metric import Evidence, estimate_scale
 from pipeprog_sfm.motion import Acceleration, Motion, TransformTree
 from pipeprog_sfm.scale import NoScaleError, PoseCovariance, ScaleEstimate
+from pipeprog_sfm.target_file import Targets
 
 
 class BoardTracker:
@@ -22,13 +23,11 @@ class BoardTracker:
 
     def __init__(
         self,
-        boards: Sequence[Board],
+        targets: Targets,
         config: BoardConfig,
-        distances: Sequence[Distance] = (),
         odometry: OdometryConfig = OdometryConfig(),  # noqa: B008  # frozen
     ) -> None:
-        self._boards = tuple(boards)
-        self._distances = tuple(distances)
+        self._targets = targets
         self._config = config
         self._odometry = odometry
         self._camera: Camera | None = None
@@ -50,7 +49,7 @@ class BoardTracker:
         self._frame = frame
         self._camera = camera
         ellipses = find_ellipses(gray, camera, self._config)
-        found = identify(ellipses, self._boards, camera)
+        found = identify(ellipses, self._targets.boards, camera)
         if len(ellipses):
             self._ellipses[stamp] = ellipses
         if found:
@@ -78,8 +77,7 @@ class BoardTracker:
         if self._camera is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
         evidence = Evidence(
-            self._boards,
-            self._distances,
+            self._targets,
             self._observations,
             self._ellipses,
             self._transforms,

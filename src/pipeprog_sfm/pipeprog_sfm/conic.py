@@ -113,8 +113,8 @@ def circles_from_conics(conics: FloatArray, camera_matrix: FloatArray, radius: f
 
 
 def conic_score(
-    conic_a: FloatArray, conic_b: FloatArray, projection_a: FloatArray, projection_b: FloatArray, origin: FloatArray
-) -> float:
+    conics_a: FloatArray, conics_b: FloatArray, projection_a: FloatArray, projection_b: FloatArray, origins: FloatArray
+) -> FloatArray:
     """How far two ellipses in two views are from being images of one plane conic: 0 for a true match.
 
     With the cones Q = P^T C P, det(Qa + l Qb) = l (I2 l^2 + I3 l + I4); the pencil of two cones over one plane conic
@@ -122,26 +122,31 @@ def conic_score(
     |I3^2 - 4 I2 I4| / I3^2; 0.1 separates true matches from wrong ones at the noise of a good reconstruction.
 
     Args:
-        conic_a: (3, 3) conic in the first view, pixels.
-        conic_b: (3, 3) conic in the second view, pixels.
+        conics_a: (..., 3, 3) conics in the first view, pixels.
+        conics_b: (..., 3, 3) conics in the second view, pixels.
         projection_a: (3, 4) projection matrix K [R t] of the first view.
         projection_b: (3, 4) projection matrix of the second view.
-        origin: (3,) point near the target, such as its triangulated centre: moves the origin there, which the
-            determinants need for their conditioning.
+        origins: (..., 3) points near the targets, such as their triangulated centres: each moves the origin there,
+            which the determinants need for their conditioning.
+
+    Returns:
+        (...) scores.
     """
-    shift = np.eye(4)
-    shift[:3, 3] = origin
+    shifts = np.tile(np.eye(4), (*origins.shape[:-1], 1, 1))
+    shifts[..., :3, 3] = origins
     cones = []
-    for conic, projection in ((conic_a, projection_a), (conic_b, projection_b)):
-        moved = projection @ shift
-        cone = moved.T @ conic @ moved
-        cones.append(cone / np.linalg.norm(cone))
+    for conics, projection in ((conics_a, projection_a), (conics_b, projection_b)):
+        moved = projection @ shifts
+        cones.append(_unit(moved.swapaxes(-1, -2) @ conics @ moved))
     # Rescale the unit of length so that the rotation and translation parts of the cones weigh alike.
-    size = np.sqrt(abs(cones[0][3, 3]) / np.linalg.norm(cones[0][:3, :3])) + 1e-12
-    unit = np.diag([size, size, size, 1.0])
-    first, second = (unit @ cone @ unit for cone in cones)
-    first, second = first / np.linalg.norm(first), second / np.linalg.norm(second)
+    size = np.sqrt(np.abs(cones[0][..., 3, 3]) / np.linalg.norm(cones[0][..., :3, :3], axis=(-2, -1))) + 1e-12
+    unit = np.stack([size, size, size, np.ones_like(size)], axis=-1)
+    first, second = (_unit(unit[..., :, None] * cone * unit[..., None, :]) for cone in cones)
     roots = np.array([-2.0, -1.0, 1.0, 2.0])
-    values = np.array([np.linalg.det(first + root * second) for root in roots])
-    i2, i3, i4 = np.linalg.lstsq(np.stack([roots**3, roots**2, roots], axis=1), values, rcond=None)[0]
-    return float(abs(i3**2 - 4.0 * i2 * i4) / max(i3**2, 1e-300))
+    values = np.stack([np.linalg.det(first + root * second) for root in roots], axis=-1)
+    i2, i3, i4 = np.moveaxis(values @ np.linalg.pinv(np.stack([roots**3, roots**2, roots], axis=1)).T, -1, 0)
+    return np.asarray(np.abs(i3**2 - 4.0 * i2 * i4) / np.maximum(i3**2, 1e-300))
+
+
+def _unit(matrices: FloatArray) -> FloatArray:
+    return np.asarray(matrices / np.linalg.norm(matrices, axis=(-2, -1), keepdims=True))

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.board import Board, BoardObservation, Distance
+from pipeprog_sfm.board import BoardObservation
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses
 from pipeprog_sfm.gravity import GravityError, gravity
 from pipeprog_sfm.map_frame import Vertical, board_vertical, camera_up, map_from_model, path_vertical
+from pipeprog_sfm.marks import MarksError, find_marks
 from pipeprog_sfm.motion import Acceleration, NoPathError, TransformTree
 from pipeprog_sfm.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.placement import BoardPlacement, PlacedBoard, contradiction, measure, place_boards, sensitivity
@@ -27,6 +28,7 @@ from pipeprog_sfm.scale import (
     distance_measurement,
 )
 from pipeprog_sfm.structure import StructureError, structure_vertical
+from pipeprog_sfm.target_file import Targets
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,7 @@ class Evidence:
     """What was seen of targets, and what a robot told of its motion.
 
     Attributes:
-        boards: the boards of the file.
-        distances: measured distances between their circles.
+        targets: what the file says.
         observations: boards seen, by image stamp [ns].
         ellipses: all ellipses of the images, by stamp: boards of which only a circle is in view take part, too.
         transforms: odometry and TF.
@@ -43,8 +44,7 @@ class Evidence:
         camera_frame: name of the camera's optical frame.
     """
 
-    boards: Sequence[Board] = ()
-    distances: Sequence[Distance] = ()
+    targets: Targets = Targets()  # noqa: RUF009  # frozen
     observations: Mapping[int, Sequence[BoardObservation]] = field(default_factory=dict)
     ellipses: Mapping[int, TargetEllipses] | None = None
     transforms: TransformTree = field(default_factory=TransformTree)
@@ -89,12 +89,20 @@ def estimate_scale(
     inherited = [sensitivity(place, poses, camera, config) for place in places]
     measurements += [board_measurement(*pair, stamps, config) for pair in zip(places, inherited, strict=True)]
     by_name = {place.board.name: (place, own) for place, own in reversed(list(zip(places, inherited, strict=True)))}
-    for distance in evidence.distances:
+    for distance in evidence.targets.distances:
         measurement = distance_measurement(distance, by_name, stamps)
         if measurement is None:
             warnings.append(f"the distance {distance.name} tells nothing: its boards were not both measured")
         else:
             measurements.append(measurement)
+    for pair in evidence.targets.marks:
+        try:
+            ends = find_marks(pair, _loose(evidence, places), poses, camera, config)
+        except MarksError as error:
+            warnings.append(str(error))
+        else:
+            placed = {name: (place, sensitivity(place, poses, camera, config)) for name, place in ends.items()}
+            measurements += [one for one in [distance_measurement(pair.distance, placed, stamps)] if one]
     path = None
     if evidence.transforms:
         try:
@@ -102,7 +110,7 @@ def estimate_scale(
             measurements.append(odometry_measurement(path, poses, odometry))
         except (NoPathError, OdometryError) as error:
             warnings.append(str(error))
-    if refusal is not None and (not measurements or evidence.boards):
+    if refusal is not None and (not measurements or evidence.targets.boards):
         warnings.insert(0, str(refusal))
     if not measurements:
         assert refusal is not None
@@ -149,17 +157,27 @@ def _gravity(evidence: Evidence, poses: Mapping[int, FloatArray], scale: float) 
     return gravity(np.array([one.stamp for one in evidence.accelerations], np.int64), forces, poses, scale)
 
 
+def _loose(evidence: Evidence, places: Sequence[PlacedBoard]) -> dict[int, TargetEllipses]:
+    """The ellipses that belong to no board."""
+    taken = {(view.stamp, *centre) for place in places for view in place.views for centre in view.seen.ellipse_centres}
+    loose = {}
+    for stamp, seen in (evidence.ellipses or {}).items():
+        free = np.array([(stamp, *centre) not in taken for centre in seen.centres], bool)
+        loose[stamp] = TargetEllipses(seen.centres[free], seen.shapes[free], seen.rms[free])
+    return loose
+
+
 def _sound_boards(
     evidence: Evidence, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig
 ) -> tuple[list[PlacedBoard], list[BoardPlacement], list[str]]:
     """Boards that agree with their file, what was measured of them, and why others were refused."""
-    if not evidence.boards:
+    if not evidence.targets.boards:
         raise NoScaleError("no_board", "nothing tells the scale: hang up a board and name its file, or record odometry")
     seen = sum(stamp in poses and len(found) > 0 for stamp, found in evidence.observations.items())
     if not seen:
-        names = ", ".join(board.name for board in evidence.boards)
+        names = ", ".join(board.name for board in evidence.targets.boards)
         raise NoScaleError("no_board", f"no board ({names}) was identified in any of {len(poses)} images with a pose")
-    found = place_boards(evidence.observations, poses, camera, evidence.boards, config, evidence.ellipses)
+    found = place_boards(evidence.observations, poses, camera, evidence.targets.boards, config, evidence.ellipses)
     if not found:
         raise NoScaleError("too_few_views", f"a board was seen in {seen} images, but from too few sides to be measured")
     measured = [(place, measure(place, poses, camera, config)) for place in found]

@@ -26,12 +26,12 @@ from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
-from pipeprog_sfm.board import load_boards, load_distances
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.journal import Journal
 from pipeprog_sfm.mapper import FrameTie
 from pipeprog_sfm.motion import Acceleration, Motion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
+from pipeprog_sfm.target_file import Targets, load_targets
 from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Ready, Retire, Retired, serve
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
@@ -46,15 +46,14 @@ class SfmNode(Node):
         super().__init__("sfm")
         config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep"))
         board = str(self.declare_parameter("board", "").value)
-        boards = load_boards(board) if board else []
-        distances = load_distances(board, boards) if board else []
+        targets = load_targets(board) if board else Targets()
         self._colmap = str(self.declare_parameter("colmap", "").value)
         lockstep = bool(self.declare_parameter("lockstep", False).value)
         # A replay that loses its reconstruction ends; on the robot it is begun anew.
         self._journal = None if lockstep else Journal()
         self._answered = 0  # commands of the journal
         self._vain_starts = 0
-        self._arguments = config, boards, distances
+        self._arguments = config, targets
         self._worker = self._start_worker()
         self._images: dict[int, CompressedImage] = {}
         self._cameras: dict[int, tuple[str, Camera]] = {}

@@ -27,6 +27,7 @@ PRIOR_CENTRE = 0.03
 PRIOR_POSE = 0.1
 PRIOR_WEIGHT = 4.0
 
+LEAST_SINE = np.sin(np.deg2rad(1.0))  # of the angle between two rays that give a point
 PARTNERS = 6  # images that each image is paired with, near to far, to place a board
 CAUCHY = 2.385  # 95 % efficiency for normal errors
 CAUCHY_SQUARE = 0.630  # mean of weight times squared residual, of normal errors in two dimensions, over that without
@@ -225,6 +226,21 @@ def _completed(
     return _adjusted(place.board, views, place.placement, poses, camera, config) if len(views) >= 2 else place
 
 
+def place_circle(
+    board: Board,
+    start: FloatArray,
+    poses: Mapping[int, FloatArray],
+    camera: Camera,
+    config: BoardConfig,
+    ellipses: Mapping[int, TargetEllipses],
+) -> PlacedBoard:
+    """A board of one circle, of which a place is known already, adjusted on every image that shows it.
+
+    One circle fixes neither the turn in its plane nor the size of the model: these stay as `start` (4, 4) has them.
+    """
+    return _completed(PlacedBoard(board, (), start, 0.0, PRIOR_CENTRE, PRIOR_POSE), poses, camera, config, ellipses)
+
+
 def _metric(camera_from_board: FloatArray, scale: float) -> FloatArray:
     """Camera from board with both in metres, from the product of a pose and a similarity."""
     metric = camera_from_board.copy()
@@ -298,17 +314,30 @@ def _from_pair(
         ray = np.einsum("nji,nj->ni", rotations, np.c_[part.pixels[chosen], np.ones(len(chosen))] @ inverse.T)
         rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
         origins.append(-np.einsum("nji,nj->ni", rotations, part.translations[chosen]))
-    cosine = np.einsum("ni,ni->n", *rays)
-    sine2 = 1 - cosine**2
-    if sine2.min() < np.sin(np.deg2rad(1.0)) ** 2:
+    points, depths, sines = midpoints(origins[0], rays[0], origins[1], rays[1])
+    if sines.min() < LEAST_SINE or depths.min() <= 0:
         return None
-    gap = origins[1] - origins[0]
-    along = [np.einsum("ni,ni->n", ray, gap) for ray in rays]
-    depths = ((along[0] - cosine * along[1]) / sine2, (cosine * along[0] - along[1]) / sine2)
-    if min(depth.min() for depth in depths) <= 0:
-        return None
-    points = 0.5 * sum(origin + depth[:, None] * ray for origin, depth, ray in zip(origins, depths, rays, strict=True))
     return similarity(board.centres[common], points)
+
+
+def midpoints(
+    origins_a: FloatArray, rays_a: FloatArray, origins_b: FloatArray, rays_b: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points (..., 3) halfway between rays from two places, with their depths (2, ...) and the rays' sine (...).
+
+    Args:
+        origins_a: (..., 3) places of the first camera.
+        rays_a: (..., 3) unit directions.
+        origins_b: (..., 3) places of the second camera.
+        rays_b: (..., 3) unit directions.
+    """
+    cosine = (rays_a * rays_b).sum(-1)
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    gap = origins_b - origins_a
+    along_a, along_b = (rays_a * gap).sum(-1), (rays_b * gap).sum(-1)
+    depths = np.stack([(along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2])
+    points = 0.5 * (origins_a + depths[0][..., None] * rays_a + origins_b + depths[1][..., None] * rays_b)
+    return points, depths, np.sqrt(sine2)
 
 
 def similarity(source: FloatArray, target: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.board import Board, Distance
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.colmap import ModelView, write_model
 from pipeprog_sfm.config import SfmConfig
@@ -23,6 +22,7 @@ from pipeprog_sfm.fusion import FusedCloud
 from pipeprog_sfm.mapper import FrameTie, KeyframeReport, Mapper
 from pipeprog_sfm.motion import Motion
 from pipeprog_sfm.scale import NoScaleError, ScaleEstimate
+from pipeprog_sfm.target_file import Targets
 
 FloatArray = NDArray[np.float64]
 
@@ -72,9 +72,9 @@ class MetricMap:
 class Reconstruction:
     """Sparse poses, scale, depth maps and fusion over a stream of keyframes."""
 
-    def __init__(self, config: SfmConfig, boards: Sequence[Board], distances: Sequence[Distance] = ()) -> None:
+    def __init__(self, config: SfmConfig, targets: Targets) -> None:
         self._mapper = Mapper(config.mapper, config.seed)
-        self._targets = BoardTracker(boards, config.board, distances, config.odometry)
+        self._targets = BoardTracker(targets, config.board, config.odometry)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
         self._pending: tuple[ScaleEstimate, Trajectory, Future[FusedCloud]] | None = None

@@ -10,6 +10,7 @@ from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.fusion import fuse
 from pipeprog_sfm.reconstruction import Reconstruction
 from pipeprog_sfm.stereo import StereoImage, depth_map
+from pipeprog_sfm.target_file import Targets
 
 SIZE = (320, 240)
 DEPTHS = (0.7, 1.5)
@@ -22,7 +23,7 @@ def warm_up(config: SfmConfig) -> None:
     camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2)
     wall = np.random.default_rng(0).integers(0, 256, (height // 4, width), np.uint8)
     wall = cv2.resize(wall, (4 * width, height), interpolation=cv2.INTER_CUBIC)
-    reconstruction = Reconstruction(config, [])
+    reconstruction = Reconstruction(config, Targets())
     views = []
     for number in range(5):
         gray = np.ascontiguousarray(wall[:, number * STEP :][:, :width])

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.board import Board, Distance
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.mapper import FrameTie
 from pipeprog_sfm.motion import Motion
 from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
+from pipeprog_sfm.target_file import Targets
 from pipeprog_sfm.warm_up import warm_up
 
 IDLE_SECONDS = 1.0  # without a command, after which a map goes out early: nobody knows when the next keyframe comes
@@ -90,13 +90,12 @@ class Finished:
 def serve(
     connection: Connection,
     config: SfmConfig,
-    boards: Sequence[Board],
-    distances: Sequence[Distance],
+    targets: Targets,
     answered: Iterable[Keyframe | Retire],
 ) -> None:
     """Works off commands from `connection` until it closes; those that a predecessor has answered come before."""
     warm_up(config)
-    reconstruction = Reconstruction(config, boards, distances)
+    reconstruction = Reconstruction(config, targets)
     for command in answered:
         _answer(reconstruction, command)
         reconstruction.update_dense()

@@ -66,3 +66,33 @@ def render(board: Board, pose: np.ndarray, camera: Camera = CAMERA, seed: int = 
     image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     image = cv2.GaussianBlur(image, (0, 0), 0.7) + rng.normal(0, 2.0, image.shape)
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+AT_ORIGIN = (BOARD, np.eye(4))
+
+
+class Walk:
+    """A camera that walks past boards in a world of metres, and a model that is that world up to a similarity."""
+
+    def __init__(self, seed, views=8, noise=0.0, pose_noise=0.0, boards=(AT_ORIGIN,), span=1.6, follow=0.6, roll=0.0):
+        rng = np.random.default_rng(seed)
+        self.factor = rng.uniform(0.2, 5.0)  # model units per metre
+        self.model_from_board = np.eye(4)
+        self.model_from_board[:3, :3] = self.factor * Rotation.random(random_state=seed).as_matrix()
+        self.model_from_board[:3, 3] = rng.normal(0, 3, 3)
+        self.poses, self.ellipses = {}, {}
+        for stamp in range(views):
+            x = span * (stamp / max(views - 1, 1) - 0.5)
+            pose = camera_from_board((x, rng.normal(0, 0.1), 1.6 + rng.normal(0, 0.1)), (follow * x, 0, 0), roll)
+            seen = [pose @ place for _, place in boards]
+            self.ellipses[stamp] = exact_ellipses([board for board, _ in boards], seen, noise=noise, rng=rng)
+            moved = pose.copy()
+            moved[:3, 3] += rng.normal(0, pose_noise, 3)
+            self.poses[stamp] = self.in_model(moved)
+
+    def in_model(self, camera_from_board_pose):
+        pose = np.eye(4)
+        pose[:3, :3] = camera_from_board_pose[:3, :3] @ self.model_from_board[:3, :3].T / self.factor
+        centre = -camera_from_board_pose[:3, :3].T @ camera_from_board_pose[:3, 3]
+        pose[:3, 3] = -pose[:3, :3] @ (self.model_from_board[:3, :3] @ centre + self.model_from_board[:3, 3])
+        return pose

@@ -66,7 +66,7 @@ def test_conic_score_tells_the_same_circle_from_another():
     centres = np.array([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0]])
     conics = [conic_from_ellipse(*project_circles(CAMERA.matrix, pose, centres, RADIUS)) for pose in poses]
     cameras = [CAMERA.matrix @ pose[:3] for pose in poses]
-    true = conic_score(conics[0][0], conics[1][0], *cameras, centres[0])
-    wrong = conic_score(conics[0][0], conics[1][1], *cameras, centres.mean(0))
+    origins = np.stack([centres[0], centres.mean(0)])
+    true, wrong = conic_score(conics[0][[0, 0]], conics[1], *cameras, origins)
     assert true < 1e-6
     assert wrong > 0.1
