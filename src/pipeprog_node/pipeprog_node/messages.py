@@ -78,22 +78,6 @@ def image_from_msg(message: Image) -> NDArray[np.uint8]:
     return image if conversion is None else cv2.cvtColor(image, conversion).astype(np.uint8, copy=False)
 
 
-def image_from_compressed(message: CompressedImage) -> NDArray[np.uint8]:
-    """(H, W) grey or (H, W, 3) BGR, as stored: the calibration knows nothing of an EXIF rotation.
-
-    The bytes say what they are, so `format` may say anything; raises InputError where they are damaged.
-    """
-    data = np.frombuffer(message.data, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if image is None:
-        raise InputError(f"damaged image: {data.size} bytes of format '{message.format}' are no JPEG or PNG")
-    if image.dtype != np.uint8:
-        image = _to_8_bits(image)
-    if image.ndim == 3 and image.shape[2] == 4:
-        image = image[:, :, :3]
-    return np.ascontiguousarray(image, np.uint8)
-
-
 def encode_jpeg(image: NDArray[np.uint8], quality: int = 95) -> bytes:
     """JPEG of a (H, W) grey or (H, W, 3) BGR image."""
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
