@@ -16,6 +16,28 @@ class MapperConfig:
 
 
 @dataclass(frozen=True)
+class DeblurConfig:
+    """Motion blur, undone for the features of keyframes."""
+
+    exposure: float = field(
+        default=0.0,
+        metadata={
+            "description": "exposure time of an image; 0: not known, so that no motion blur is undone",
+            "unit": "s",
+            "range": (0.0, 1.0),
+        },
+    )
+    min_length: float = field(
+        default=2.0,
+        metadata={
+            "description": "motion during the exposure from which on it is undone, as the median over the image",
+            "unit": "px",
+            "range": (0.5, 100.0),
+        },
+    )
+
+
+@dataclass(frozen=True)
 class BoardConfig:
     """Targets and scale."""
 
@@ -107,6 +129,7 @@ class SfmConfig:
         metadata={"description": "keyframes between two publications of the map", "unit": "", "range": (1, 1000)},
     )
     mapper: MapperConfig = field(default_factory=MapperConfig)
+    deblur: DeblurConfig = field(default_factory=DeblurConfig)
     board: BoardConfig = field(default_factory=BoardConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)

@@ -106,7 +106,7 @@ class Mapper:
         self._cursor = 0
         self._tied: dict[int, tuple[int | None, int, int | None]] = {}
         self._retired: dict[int, _Keyframe] = {}
-        self._matches: dict[tuple[int, int, int], MatchArray] = {}
+        self._matches: dict[tuple[int, int, int | None], MatchArray] = {}
 
     @property
     def seen(self) -> int:
@@ -169,6 +169,37 @@ class Mapper:
         if len(self._models) > 1:
             self._merge(stamp)
         return self._report(stamp)
+
+    def exchange(self, stamp: int, features: Features) -> bool:
+        """Gives a keyframe other features, and a pose by them, where more of them agree with what its neighbours see.
+
+        Returns whether it has; else all stays as it was.
+        """
+        known = self._keyframes[stamp]
+        other = _keyframe(stamp, features, known.camera)
+        model = self._model_of(stamp) or min(self._models, key=lambda model: _distance(model, stamp), default=None)
+        if model is None or len(model) < 3:
+            return False
+        agreeing = []
+        for keyframe in (known, other):
+            self._forget_matches(stamp)
+            agreeing.append(len(self._locate(model, keyframe, _neighbours(model, stamp), None).pairs))
+        if agreeing[1] <= agreeing[0]:
+            self._forget_matches(stamp)
+            return False
+        if stamp in model.stamps:
+            self._drop(model, model.stamps.index(stamp))
+        else:
+            self._waiting.remove(stamp)
+        for evidence in self._evidence.values():
+            evidence.pop(stamp, None)
+        for keyframe in (other, known):
+            self._keyframes[stamp] = keyframe
+            if self._register(model, keyframe, _neighbours(model, stamp), None).registered:
+                return keyframe is other
+            self._forget_matches(stamp)
+        self._waiting.append(stamp)
+        return False
 
     def retire(self, stamps: Collection[int]) -> None:
         """Takes keyframes out of the map: pose and observations; unknown stamps are ignored.
@@ -306,14 +337,13 @@ class Mapper:
         """By the neighbours in time; failing that, by views that look alike."""
         report = KeyframeReport(keyframe.stamp, False, "no model has been started yet", 0, 0.0)
         for model in sorted(self._models, key=lambda model: _distance(model, keyframe.stamp))[:2]:
-            nearest = np.argsort(np.abs(np.array(model.stamps) - keyframe.stamp), kind="stable")[:2]
-            report = self._register(model, keyframe, nearest, COARSE)
+            report = self._register(model, keyframe, _neighbours(model, keyframe.stamp), COARSE)
             if report.registered:
                 return report
         for model in sorted(self._models, key=len, reverse=True)[:2]:
             alike = self._alike(model, keyframe)
             if len(alike):
-                report = self._register(model, keyframe, alike, len(keyframe.features))
+                report = self._register(model, keyframe, alike, None)
             if report.registered:
                 return report
         return report
@@ -327,16 +357,16 @@ class Mapper:
         order = np.argsort(-np.array(found), kind="stable")[:ALIKE]
         return views[order][np.array(found)[order] > 0]
 
-    def _matched(self, keyframe: _Keyframe, other: _Keyframe, count: int) -> MatchArray:
-        """Matches of the `count` strongest features of two keyframes, found once."""
+    def _matched(self, keyframe: _Keyframe, other: _Keyframe, count: int | None) -> MatchArray:
+        """Matches of the `count` strongest features (None: of all) of two keyframes, found once."""
         pair = keyframe.stamp, other.stamp, count
         if pair not in self._matches:
             self._matches[pair] = match(keyframe.features.descriptors[:count], other.features.descriptors[:count])
             _forget_oldest(self._matches, PAIRS_REMEMBERED)
         return self._matches[pair]
 
-    def _locate(self, model: SparseModel, keyframe: _Keyframe, anchors: IntArray, count: int) -> _Location:
-        """Pose by the map points that the anchors see, from the `count` strongest features."""
+    def _locate(self, model: SparseModel, keyframe: _Keyframe, anchors: IntArray, count: int | None) -> _Location:
+        """Pose by the map points that the anchors see, from the `count` strongest features (None: from all)."""
         evidence = {}
         pairs = []
         for view in anchors:
@@ -357,11 +387,16 @@ class Mapper:
                 return _Location(None, known[:0], evidence, reason)
         return _Location(pose.camera_from_model, known[pose.inliers], evidence, "")
 
+    def _forget_matches(self, stamp: int) -> None:
+        self._matches = {pair: found for pair, found in self._matches.items() if stamp not in pair[:2]}
+
     def _absolute_pose(self, model: SparseModel, keyframe: _Keyframe, pairs: IntArray) -> AbsolutePose | None:
         pixels, points = keyframe.features.keypoints[pairs[:, 0]], model.points[pairs[:, 1]]
         return absolute_pose(pixels, points, keyframe.camera, POSE_ERROR, self._seed)
 
-    def _register(self, model: SparseModel, keyframe: _Keyframe, anchors: IntArray, count: int) -> KeyframeReport:
+    def _register(
+        self, model: SparseModel, keyframe: _Keyframe, anchors: IntArray, count: int | None
+    ) -> KeyframeReport:
         """Pose, then matches, tracks and local adjustment; taken back when the result is thin or contradictory."""
         location = self._locate(model, keyframe, anchors, count)
         used = location.pairs
@@ -523,7 +558,7 @@ class Mapper:
             alike = self._alike(other, keyframe)
             if not len(alike):
                 continue
-            location = self._locate(other, keyframe, alike, len(keyframe.features))
+            location = self._locate(other, keyframe, alike, None)
             if location.camera_from_model is None:
                 continue
             view = own.stamps.index(stamp)
@@ -603,6 +638,12 @@ def _tracks(model: SparseModel) -> int:
 def _distance(model: SparseModel, stamp: int) -> int:
     """Time to the model's nearest view, ns."""
     return min(abs(other - stamp) for other in model.stamps)
+
+
+def _neighbours(model: SparseModel, stamp: int) -> IntArray:
+    """The two views nearest in time, without the keyframe itself."""
+    gap = np.abs(np.array(model.stamps) - stamp)
+    return np.array([view for view in np.argsort(gap, kind="stable")[:3] if gap[view]][:2], np.int64)
 
 
 def _common(points: IntArray | None, others: IntArray | None) -> int:

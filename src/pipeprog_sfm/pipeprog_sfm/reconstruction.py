@@ -17,6 +17,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.colmap import ModelView, write_model
 from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense import DenseMapper, EncodedImage, centre
 from pipeprog_sfm.fusion import FusedCloud
 from pipeprog_sfm.mapper import FrameTie, KeyframeReport, Mapper
@@ -74,6 +75,7 @@ class Reconstruction:
 
     def __init__(self, config: SfmConfig, targets: Targets) -> None:
         self._mapper = Mapper(config.mapper, config.seed)
+        self._deblurrer = Deblurrer(config, self._mapper)
         self._targets = BoardTracker(targets, config.board, config.odometry)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
@@ -97,7 +99,9 @@ class Reconstruction:
         # Features and targets are measured in the image as it is: their points are undistorted, not resampled.
         if self._targets.add(stamp, gray, camera, frame):
             self._scaled = -1
-        return self._mapper.add(stamp, gray, camera)
+        report = self._mapper.add(stamp, gray, camera)
+        self._deblurrer.add(stamp, self._images[stamp])
+        return report
 
     def update_dense(self) -> None:
         """Starts the depth maps that can be made by now; they are worked off in a thread of their own."""
@@ -118,6 +122,7 @@ class Reconstruction:
         What they have added to the cloud stays until the cloud is made anew, at the latest for the final map.
         """
         self._mapper.retire(stamps)
+        self._deblurrer.retire(stamps)
         self._targets.retire(stamps)
         self._dense.retire(stamps)
         for stamp in stamps:

@@ -254,3 +254,38 @@ def test_what_is_remembered_of_retired_keyframes_is_bounded(monkeypatch: pytest.
         mapper.add(n * STEP, np.zeros((2, 2), np.uint8), CAMERA)
     with pytest.raises(pytest.fail.Exception, match="searched again"):
         mapper.add(2 * STEP, np.zeros((2, 2), np.uint8), CAMERA)
+
+
+def blurred(features: Features, kept: int) -> Features:
+    """What is left of features: the first `kept`, the others somewhere else."""
+    rng = np.random.default_rng(0)
+    keypoints = features.keypoints.copy()
+    keypoints[kept:] = rng.uniform([0, 0], [1280, 720], (len(keypoints) - kept, 2))
+    return Features(keypoints, features.descriptors)
+
+
+@pytest.mark.parametrize("kept", [0, 600])
+def test_features_that_fit_better_are_taken(kept: int) -> None:
+    """600 features are enough for a pose, none are not; the sharper ones then hold the keyframe as any other."""
+    mapper = Mapper(MapperConfig())
+    truth = {n * STEP: pose(0.2 * n) for n in range(8)}
+    for n, stamp in enumerate(truth):
+        features = view(truth[stamp], n)
+        mapper.add_features(stamp, blurred(features, kept) if n == 4 else features, CAMERA)
+    assert (4 * STEP in mapper.camera_from_model()) == (kept > 0)
+    assert mapper.exchange(4 * STEP, view(truth[4 * STEP], 4))
+    assert (mapper.registered, mapper.waiting) == (8, 0)
+    mapper.finish()
+    poses = mapper.camera_from_model()
+    assert list(poses) == list(truth)
+    assert position_errors(poses, truth).max() < POSITION_TOLERANCE
+    ties = {tie.stamp: tie for tie in mapper.ties()}
+    assert ties[4 * STEP].matches_next > 0.7 * ties[3 * STEP].matches_previous
+
+
+def test_features_that_fit_worse_change_nothing() -> None:
+    mapper, truth = walk(np.arange(0, 1.6, 0.2))
+    before = mapper.camera_from_model()
+    assert not mapper.exchange(4 * STEP, blurred(view(truth[4 * STEP], 4), 600))
+    after = mapper.camera_from_model()
+    assert all(after[stamp].tobytes() == before[stamp].tobytes() for stamp in before)
