@@ -63,9 +63,9 @@ def draw(
         _paint(image, depth, pipe, axes, low, pixel)
     image = _shaded(image, depth, pixel)
     image = cv2.resize(image, (width, size[1] // OVERSAMPLING), interpolation=cv2.INTER_AREA)
+    taken: list[tuple[FloatArray, FloatArray]] = []
     for pipe in pipes:
-        middle = (pipe.cylinder.start + pipe.cylinder.end) / 2
-        _label(image, pipe.label, (axes[:2] @ middle - low) / pixel / OVERSAMPLING)
+        _label(image, pipe.label, _label_places(pipe, depth, axes, low, pixel), taken)
     return image
 
 
@@ -221,8 +221,26 @@ def _paint(
     image[top:bottom, left:right][seen] = np.clip(tint[seen], 0, 255)
 
 
-def _label(image: NDArray[np.uint8], text: str, place: FloatArray) -> None:
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 0.5, 1)
-    corner = int(place[0] - width / 2), int(place[1] + height / 2)
+def _label_places(
+    pipe: ColoredPipe, depth: NDArray[np.float32], axes: FloatArray, corner: FloatArray, pixel: float
+) -> FloatArray:
+    """Where (P, 2) [px of the reduced picture] a label may stand on a pipe: where it is seen, the middle first."""
+    cylinder = pipe.cylinder
+    steps = 0.5 + np.array([0, 1, -1, 2, -2, 3, -3, 4, -4])[:, None] / 10
+    points = (cylinder.start + steps * (cylinder.end - cylinder.start)) @ axes.T
+    places = (points[:, :2] - corner) / pixel
+    column, row = np.clip(places.astype(int), 0, np.array(depth.shape[::-1]) - 1).T
+    seen = depth[row, column] < points[:, 2] + 2 * cylinder.radius + LIFT
+    return np.concatenate([places[seen], places[~seen]]) / OVERSAMPLING
+
+
+def _label(image: NDArray[np.uint8], text: str, places: FloatArray, taken: list[tuple[FloatArray, FloatArray]]) -> None:
+    """Write `text` at the first place whose box is free of those in `taken`, or at the first; takes the box."""
+    size = np.array(cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 0.5, 1)[0])
+    boxes = [(place - size / 2 - 2, place + size / 2 + 2) for place in places]
+    free = (box for box in boxes if not any(((box[0] < high) & (low < box[1])).all() for low, high in taken))
+    low, high = next(free, boxes[0])
+    taken.append((low, high))
+    corner = int(low[0] + 2), int(high[1] - 2)
     for color, thickness in (((255, 255, 255), 4), ((20, 20, 20), 1)):
         cv2.putText(image, text, corner, cv2.FONT_HERSHEY_DUPLEX, 0.5, color, thickness, cv2.LINE_AA)
