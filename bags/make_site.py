@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from enum import Enum
@@ -99,7 +100,7 @@ def make_site(
     surface: Annotated[bool, typer.Option(help="also NAME.surface.npz: true surface points and their pipes")] = False,
     board_error_mm: Annotated[float, typer.Option(help="standard deviation of a printed circle's place", min=0)] = 0.0,
     allow_hidden: Annotated[bool, typer.Option(help="accept a recording that does not show every pipe")] = False,
-    jobs: Annotated[int, typer.Option(help="frames rendered at a time", min=1)] = 1,
+    jobs: Annotated[int, typer.Option(help="frames rendered at a time", min=1)] = os.cpu_count() or 1,
 ) -> None:
     """Build a site from a seed, walk a camera through it, and write what it sees and what is true."""
     console = Console(stderr=True)

@@ -53,5 +53,5 @@ def made(recording: Recording) -> Recording:
     """The recording, made now if it is not there; the generator shows its progress."""
     if not recording.bag.exists():
         arguments = recording.made_by.split()
-        subprocess.run([sys.executable, *arguments, "--jobs", "2"], cwd=ROOT, check=True)
+        subprocess.run([sys.executable, *arguments], cwd=ROOT, check=True)
     return recording

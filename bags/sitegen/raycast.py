@@ -186,12 +186,12 @@ def intersect(
         return miss
 
     ring, tube, half = g[12], g[13], g[14]
-    sine, cosine = math.sin(half), math.cos(half)
     reach = ring + tube
     b = px * ex + py * ey + pz * ez
     disc = b * b - (px * px + py * py + pz * pz - reach * reach)
     if disc <= 0.0:
         return miss
+    sine, cosine = math.sin(half), math.cos(half)
     t = max(-b - math.sqrt(disc), _NEAR)
     stop = min(-b + math.sqrt(disc), limit)
     for _ in range(_MARCH_STEPS):
