@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from benchmarks.recordings import ROOT, Recording, made, named
 from pipeprog_bringup.score import score_files
@@ -24,6 +24,7 @@ from pipeprog_bringup.score import score_files
 RESULTS = Path(__file__).parent / "results"
 RUNS = ROOT / "out" / "surveys"
 COMMAND = Path(sys.executable).with_name("pipeprog")
+FAILED = 1  # exit status of a replay that says why it cannot go on
 
 
 def survey(
@@ -41,20 +42,49 @@ def survey(
     if not kept.exists():
         results.mkdir(parents=True, exist_ok=True)
         figures = measure(made(recording), overrides, RUNS / (name or recording.name))
-        part = kept.with_suffix(".part")
-        part.write_text(json.dumps(figures, indent=1) + "\n")
-        part.replace(kept)
+        _write(kept, figures)
     known: dict[str, Any] = json.loads(kept.read_text())
     return known
 
 
-def measure(recording: Recording, overrides: Sequence[str], out: Path) -> dict[str, Any]:
+def attempt(recording: Recording, overrides: Sequence[str] = (), name: str = "") -> dict[str, Any]:
+    """As `survey`, kept in out/surveys; a replay that ends with an error is a result as well.
+
+    Its figures then hold `failed`, the replay's last words, in place of a score. What the replay shows while it works
+    goes to NAME.log beside its folder.
+    """
+    name = name or recording.name
+    kept = RUNS / f"survey_{name}.json"
+    if not kept.exists():
+        RUNS.mkdir(parents=True, exist_ok=True)
+        made(recording)
+        log = RUNS / f"{name}.log"
+        try:
+            with log.open("w") as stream:
+                figures = measure(recording, overrides, RUNS / name, stream)
+        except subprocess.CalledProcessError as error:
+            if error.returncode != FAILED:  # interrupted or killed: nothing is known
+                raise
+            words = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+            figures = {"commit": _commit(), "failed": words[-1] if words else ""}
+        _write(kept, figures)
+    known: dict[str, Any] = json.loads(kept.read_text())
+    return known
+
+
+def _write(path: Path, figures: dict[str, Any]) -> None:
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(figures, indent=1) + "\n")
+    part.replace(path)
+
+
+def measure(recording: Recording, overrides: Sequence[str], out: Path, log: IO[str] | None = None) -> dict[str, Any]:
     """Replay into `out` and score; raises CalledProcessError where the replay fails."""
     files = {kind: str(recording.beside(f"{kind}.yaml")) for kind in ("boq", "board")}
     settings = [argument for text in overrides for argument in ("--set", text)]
     options = ["--boq", files["boq"], "--board", files["board"], "--out", str(out), "--force", *settings]
     started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([COMMAND, "replay", str(recording.bag), *options], check=True)
+    subprocess.run([COMMAND, "replay", str(recording.bag), *options], check=True, stdout=log, stderr=log)
     wall, after = time.monotonic() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
     run = json.loads((out / "run.json").read_text())
     pipes = json.loads((out / "pipes.json").read_text())
