@@ -28,6 +28,7 @@ START_ANGLE = np.radians(3.0)  # median between the rays of its points
 GUIDED_RADIUS = 4.0  # px around the epipolar segment
 TEMPORAL = 3  # neighbours in time that every keyframe is matched with
 COVISIBLE = 5  # further views by predicted overlap
+SAMPLE = 50  # points that tell the overlap with every other view, to a fifteenth
 DEPTH_TOLERANCE = 0.05  # of a point's depth in two models: its noise at the smallest angle
 LOCAL_WINDOW = 8  # views that local bundle adjustment moves
 GROWTH = 1.3  # in views, between two global adjustments
@@ -295,15 +296,16 @@ class Mapper:
         model = self._published if self._models else SparseModel()
         view_of = {stamp: view for view, stamp in enumerate(model.stamps)}
         stamps = sorted(self._keyframes)
-        tied = {stamp: model.point_of[model.features(view_of[stamp])] for stamp in stamps if stamp in view_of}
-        digests = model.digests()
-        marks = {stamp: int(digests[view_of[stamp]]) if stamp in view_of else 0 for stamp in stamps}
+        tied = {stamp: model.features(view) for stamp, view in view_of.items()}
+        digests = model.digests().tolist()
+        marks = {stamp: digests[view_of[stamp]] if stamp in view_of else 0 for stamp in stamps}
         changed = []
         for before, stamp, after in zip([NO_STAMP, *stamps[:-1]], stamps, [*stamps[1:], NO_STAMP], strict=True):
             mark = (marks.get(before), marks[stamp], marks.get(after))
             if self._tied.get(stamp) != mark:
                 self._tied[stamp] = mark
-                changed.append(self._tie(stamp, tied.get(before), tied.get(stamp), tied.get(after)))
+                near = (model.point_of[tied[one]] if one in tied else None for one in (before, stamp, after))
+                changed.append(self._tie(stamp, *near))
         return changed
 
     def _tie(self, stamp: int, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> FrameTie:
@@ -460,11 +462,12 @@ class Mapper:
         gap = np.abs(np.array(model.stamps) - model.stamps[view])
         gap[view] = np.iinfo(np.int64).max
         temporal = [int(other) for other in np.argsort(gap, kind="stable")[:TEMPORAL] if other != view]
-        sample = model.points[seen[:: max(len(seen) // 200, 1)]]
-        inside = np.einsum("vij,pj->vpi", model.rotation, sample) + model.translation[:, None]
-        depth = inside[..., 2]
+        sample = model.points[seen[:: max(len(seen) // SAMPLE, 1)]]
+        # One product of matrices, coordinate by coordinate: this is all that looks at every view of the map.
+        inside = (model.rotation.reshape(-1, 3) @ sample.T).reshape(len(model), 3, -1) + model.translation[..., None]
+        depth = inside[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = inside[..., 0] / depth, inside[..., 1] / depth
+            u, v = inside[:, 0] / depth, inside[:, 1] / depth
         camera = self._keyframes[model.stamps[view]].camera
         visible = (depth > 0) & (np.abs(u) < 0.5 * camera.width / camera.fx)
         visible &= np.abs(v) < 0.5 * camera.height / camera.fy
@@ -628,7 +631,10 @@ def _forget_oldest(known: dict[Any, Any], limit: int) -> None:
 
 
 def _poses(model: SparseModel) -> dict[int, FloatArray]:
-    return {model.stamps[view]: model.pose(view) for view in np.argsort(model.stamps, kind="stable")}
+    poses = np.tile(np.eye(4), (len(model), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = model.rotation, model.translation
+    order = np.argsort(model.stamps, kind="stable")
+    return dict(zip(np.array(model.stamps)[order].tolist(), poses[order], strict=True))
 
 
 def _tracks(model: SparseModel) -> int:
