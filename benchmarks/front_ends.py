@@ -86,12 +86,22 @@ def taken(site: Site, points: int, noise: float, seed: int) -> tuple[Cloud, list
 
 def measured(site: Site, cloud: Cloud, seen: list[bool], config: DetectConfig) -> dict[str, Any]:
     """Figures of one run."""
-    radii = site.planned_radii
-    bill = Bill(tuple(PipeClass(f"{1e3 * radius:g}", radius, 10.0, (1.0, 0.0, 0.0), 0.01 * radius) for radius in radii))
+    bill = Bill(
+        tuple(
+            PipeClass(f"{1e3 * radius:g}", radius, 10.0, (1.0, 0.0, 0.0), 0.01 * radius)
+            for radius in site.planned_radii
+        )
+    )
     started = time.process_time()
     pipes = detect(cloud, bill, config)
     seconds = time.process_time() - started
     found = [segment(pipe.cylinder, pipe.id, pipe.class_name) for pipe in pipes]
+    return {"points": len(cloud.points), **judged(site, seen, found), "seconds": round(seconds, 1)}
+
+
+def judged(site: Site, seen: list[bool], found: list[Segment]) -> dict[str, Any]:
+    """What detections with their classes are worth, held against the pipes that the cloud shows."""
+    radii = site.planned_radii
     truth = [segment(Cylinder(pipe.start, pipe.end, pipe.radius), str(k)) for k, pipe in enumerate(site.pipes)]
     pairs = {k: j for k, j in match(found, truth).items() if seen[j]}
     decoys = [segment(Cylinder(np.asarray(a), np.asarray(b), radius), "") for a, b, radius in site.ignored]
@@ -104,13 +114,11 @@ def measured(site: Site, cloud: Cloud, seen: list[bool], config: DetectConfig) -
     hit = [truth[j].radius for j in pairs.values()]
     visible = [pipe.radius for pipe, is_seen in zip(truth, seen, strict=True) if is_seen]
     return {
-        "points": len(cloud.points),
         "pipes": sum(seen),
         "found": len(pairs),
         "false": len(false),
         "right_class": sum(found[k].class_name == f"{1e3 * truth[j].radius:g}" for k, j in pairs.items()),
         "radius_rmse_mm": round(1e3 * float(np.sqrt(np.mean(np.square(errors)))), 3) if errors else None,
-        "seconds": round(seconds, 1),
         "found_of": {f"{1e3 * radius:g}": f"{hit.count(radius)}/{visible.count(radius)}" for radius in radii},
     }
 

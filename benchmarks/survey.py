@@ -66,7 +66,7 @@ def attempt(recording: Recording, overrides: Sequence[str] = (), name: str = "")
             if error.returncode != FAILED:  # interrupted or killed: nothing is known
                 raise
             words = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-            figures = {"commit": _commit(), "failed": words[-1] if words else ""}
+            figures = {"commit": commit(), "failed": words[-1] if words else ""}
         _write(kept, figures)
     known: dict[str, Any] = json.loads(kept.read_text())
     return known
@@ -91,7 +91,7 @@ def measure(recording: Recording, overrides: Sequence[str], out: Path, log: IO[s
     return {
         "made_by": recording.made_by,
         "command": _relative(f"pipeprog replay {recording.bag} {' '.join(options)}"),
-        "commit": _commit(),
+        "commit": commit(),
         "cpus": os.cpu_count(),
         "wall_s": round(wall, 1),
         "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
@@ -108,7 +108,7 @@ def _relative(text: str) -> str:
     return text.replace(f"{ROOT}{os.sep}", "")
 
 
-def _commit() -> str:
+def commit() -> str:
     """The commit measured; a trailing + marks changes that are not committed."""
     arguments = ["git", "describe", "--always", "--dirty=+", "--exclude", "*"]
     return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
