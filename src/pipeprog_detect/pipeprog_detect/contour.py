@@ -84,6 +84,7 @@ def refine(
     follow: bool = True,
     known_radius: bool = False,
     depth_sigma: float = 0.0,
+    ends_known: bool = False,
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
@@ -91,7 +92,7 @@ def refine(
     much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the
     pipe is made as long as its outlines are seen, and its ends are looked for. With `known_radius`
     outlines of other radii are not looked for; `depth_sigma` [m] is what the distance from the cameras is known to,
-    where that is worse.
+    where that is worse. With `ends_known` the surface was seen between the given ends.
 
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
@@ -143,7 +144,12 @@ def refine(
     ends: list[End | None] = [None, None]
     if follow:
         offset = refined.solution.view_offset
-        ends = [find_end(refined.cylinder, at_end, *scene, offset, blur) for at_end in (False, True)]
+        whole, axis = refined.cylinder, refined.cylinder.axis
+        further = float((cylinder.start - whole.start) @ axis), float((whole.end - cylinder.end) @ axis)
+        ends = [
+            find_end(whole, at_end, views, others, offset, blur, -max(beyond, 0.0) if ends_known else None)
+            for at_end, beyond in zip((False, True), further, strict=True)
+        ]
     return _result(refined, basis, views, ends)
 
 

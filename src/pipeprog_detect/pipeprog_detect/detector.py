@@ -17,6 +17,7 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.hypotheses import Hypothesis
 from pipeprog_detect.inside import find_concave
 from pipeprog_detect.memory import Memory
+from pipeprog_detect.occlusion import with_depths
 from pipeprog_detect.octree import THREADS, Octree
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
@@ -81,7 +82,8 @@ def detect(
         return _product([Measured(each, each.cylinder, each.radius_sigma) for each in seen], bill, shift, config)
     planned_radii = [planned.outer_radius for planned in bill.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
-    jury = Jury(local_views if config.contour.enabled else [], bill, config.contour, memory)
+    judging = with_depths(local_views, points[finite] - shift) if config.contour.enabled else []
+    jury = Jury(judging, bill, config.contour, memory)
     # A cloud with normals towards cameras is stereo's, too.
     noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_detect.occlusion import behind
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 
 IntArray = NDArray[np.int64]
@@ -178,29 +179,31 @@ def stations(
 def visible(
     cylinder: Cylinder, others: Sequence[Cylinder], views: Sequence[View], at: Stations, margin: float = 3.0
 ) -> NDArray[np.bool_]:
-    """Mask (N,): stations that no other cylinder, grown by `margin` pixels, hides or touches from the front."""
+    """Mask (N,): stations that neither another cylinder, grown by `margin` pixels, nor the cloud hides from a view."""
     result = np.ones(len(at), bool)
-    if not others or not len(at):
-        return result
+    middle = 0.5 * (cylinder.start + cylinder.end)
     for index, view in enumerate(views):
         chosen = np.flatnonzero(at.view == index)
-        if not len(chosen):
-            continue
-        camera = view.camera
-        centre = camera_centre(view)
-        rays = np.stack(
-            [
-                (at.pixel[chosen, 0] - camera.cx) / camera.fx,
-                (at.pixel[chosen, 1] - camera.cy) / camera.fy,
-                np.ones(len(chosen)),
-            ],
-            axis=1,
-        )
-        rays = rays @ view.camera_from_map[:3, :3]
-        middle = 0.5 * (cylinder.start + cylinder.end)
-        own_depth = (middle + at.along[chosen, None] * cylinder.axis - centre) @ view.camera_from_map[2, :3]
-        for other in others:
-            result[chosen] &= ~_hidden_by(other, centre, rays, own_depth, margin / camera.fx)
+        if len(chosen):
+            on_axis = middle + at.along[chosen, None] * cylinder.axis
+            depth = (on_axis - camera_centre(view)) @ view.camera_from_map[2, :3]
+            result[chosen] = ~hidden(view, at.pixel[chosen], depth, others, margin)
+            result[chosen] &= ~behind(view, at.pixel[chosen], depth - cylinder.radius)
+    return result
+
+
+def hidden(
+    view: View, pixel: FloatArray, depth: FloatArray, others: Sequence[Cylinder], margin: float = 3.0
+) -> NDArray[np.bool_]:
+    """Which points (N,), seen at pixel (N, 2) at depth (N,) [m], lie behind a cylinder grown by `margin` pixels."""
+    result = np.zeros(len(depth), bool)
+    camera, centre = view.camera, camera_centre(view)
+    rays = np.stack(
+        [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(depth))], axis=1
+    )
+    rays = rays @ view.camera_from_map[:3, :3]
+    for other in others:
+        result |= _hidden_by(other, centre, rays, depth, margin / camera.fx)
     return result
 
 

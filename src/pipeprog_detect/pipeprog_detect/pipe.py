@@ -23,12 +23,16 @@ class Cloud:
 
 @dataclass(frozen=True)
 class View:
-    """One keyframe: grey image (H, W) uint8 of the ideal pinhole camera (already undistorted), and its pose."""
+    """One keyframe: grey image (H, W) uint8 of the ideal pinhole camera (already undistorted), and its pose.
+
+    `nearest` (h, w) float32, where it is known: depth [m] of what the cloud shows in each of h x w equal cells.
+    """
 
     stamp: int
     image: NDArray[np.uint8]
     camera: Camera
     camera_from_map: FloatArray
+    nearest: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ class Jury:
         for size in planned:
             start = replace(fit.cylinder, radius=size)
             sigma = abs(size - radius)
-            again = refine(start, sigma, self._views, others, self._config, (), known_radius=True)
+            again = refine(start, sigma, self._views, others, self._config, (), known_radius=True, ends_known=True)
             if again is not None and self._is_planned(again) and again.support > AS_GOOD * fit.support:
                 return again
         return fit
@@ -190,10 +190,10 @@ class Jury:
         for radius in starts:
             start = replace(cylinder, radius=radius)
             for _ in range(MAX_ROUNDS):
-                fit = refine(start, sigma, views, others, self._config, planned_radii, follow)
+                fit = refine(start, sigma, views, others, self._config, planned_radii, follow, ends_known=True)
                 if fit is None or abs(fit.cylinder.radius - start.radius) < SETTLED * start.radius:
                     break
-                start = fit.cylinder
+                start = _cut(fit.cylinder, cylinder)
             if fit is not None:
                 fits.append(fit)
         best = max(fits, key=lambda fit: fit.support, default=None)
@@ -247,10 +247,14 @@ def _contradict(candidate: Candidate, fit: ContourFit) -> bool:
 
 def _by_the_cloud(candidate: Candidate, fit: ContourFit) -> tuple[Cylinder, float]:
     """The cloud's cylinder between the ends that the keyframes show, and the standard deviation of its radius [m]."""
-    line = candidate.cylinder
-    low, high = sorted(float((end - line.start) @ line.axis) for end in (fit.cylinder.start, fit.cylinder.end))
-    cylinder = Cylinder(line.start + low * line.axis, line.start + high * line.axis, line.radius)
-    return cylinder, float(np.hypot(candidate.radius_sigma, candidate.evidence.noise))
+    sigma = float(np.hypot(candidate.radius_sigma, candidate.evidence.noise))
+    return _cut(candidate.cylinder, fit.cylinder), sigma
+
+
+def _cut(line: Cylinder, ends: Cylinder) -> Cylinder:
+    """The cylinder `line` with the ends of another one, projected."""
+    low, high = sorted(float((end - line.start) @ line.axis) for end in (ends.start, ends.end))
+    return Cylinder(line.start + low * line.axis, line.start + high * line.axis, line.radius)
 
 
 def _resolved(candidate: Candidate) -> bool:

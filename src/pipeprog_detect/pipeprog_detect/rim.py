@@ -7,24 +7,32 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-from pipeprog_detect.edges import LINEAR_LIGHT, outline_edges
-from pipeprog_detect.outline import camera_centre, project
+from pipeprog_detect.edges import LINEAR_LIGHT
+from pipeprog_detect.growth import Evidence, outline_evidence
+from pipeprog_detect.occlusion import behind
+from pipeprog_detect.outline import camera_centre, hidden, project
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.support import hits, support_profile
 
 # The barrel's part that faces the camera steeply enough to resolve lengths on it.
 HALF_ARC, SECTORS, RAYS_PER_SECTOR = np.radians(70.0), 6, 4
 # Samples for one pixel along the axis.
 SAMPLES_PER_PIXEL = 2
-# The outlines must stop: from inside the end to outside their support (0 to 1) falls by so much, or, where little of
-# the pipe can be told from its background, by this share of it; so much support is chance.
-MIN_FALL, MIN_SHARE, CHANCE = 0.3, 0.45, 0.1
-MIN_SEEN = 14
-# A rim at the edge of the searched range needs so much more of a score than one at the given end; and of two the inner
-# one ends the barrel: an elbow or a collar has further rims outside.
-FAR_PENALTY, OUTER_PENALTY = 0.3, 0.3
+# How many powers of e the places may be less probable than the best one by the outlines, and how many an edge all
+# around is worth: the outlines tell the place to a few stations, the rim within them.
+PLAUSIBLE, RIM_WORTH = 8.0, 25.0
+# The edge of what hides the barrel is none of it: so many pixels beside it are left out.
+BESIDE_HIDDEN = 4
+# What is hidden is no visible barrel: without a rim to show for it the pipe ends before it.
+UNSEEN = 1.0
+# Of two rims the inner one ends the barrel: an elbow or a collar has further rims outside.
+OUTER_PENALTY = 0.3
+# The cloud's surface mostly ends within so much of the barrel [m], but where it is torn (Cauchy).
+SURFACE_SIGMA = 0.01
+# It goes on over the end by half a stereo window [m], and into a bend of three radii by as much as that leaves the line
+# within the surface's thickness [m].
+FATTENED, THICKNESS = 0.02, 0.006
 
 
 @dataclass(frozen=True)
@@ -40,27 +48,33 @@ def find_end(
     at_end: bool,
     views: Sequence[View],
     others: Sequence[Cylinder],
-    basis: FloatArray,
     view_offset: FloatArray,
     blur: float,
+    surface_end: float | None,
 ) -> End | None:
     """The end of the straight barrel near the given one, or None where the images do not tell.
 
-    The end is where the support of the outlines falls and where, on the barrel unrolled from each view by the known
-    axis and radius, an edge lies across the axis at one position for all directions and views. The circle of the rim
-    needs no conic that way: its projection is the unrolling itself.
+    The end is where the evidence of the outlines for the pipe is complete and where, on the barrel unrolled from each
+    view by the known axis and radius, an edge lies across the axis at one position for all directions and views. The
+    circle of the rim needs no conic that way: its projection is the unrolling itself. `surface_end` [m], outwards from
+    the given end, is where the surface seen in the cloud ends, if it shows the pipe.
     """
     axis = cylinder.axis if at_end else -cylinder.axis
     end = cylinder.end if at_end else cylinder.start
     outside = max(0.15, 3.0 * cylinder.radius)
     inside = min(outside, 0.6 * cylinder.length)
+    if surface_end is not None:
+        inside = min(inside, FATTENED + float(np.sqrt(6.0 * cylinder.radius * THICKNESS)) - surface_end)
+    evidence = outline_evidence(cylinder, at_end, outside, views, others, view_offset, blur)
+    if evidence is None:
+        return None
+    position, odds = _odds(evidence, inside)
+    if not len(odds) or int(np.argmax(odds)) == len(odds) - 1:
+        return None
     distances = [np.linalg.norm(end - camera_centre(view)) for view in views]
     pixel = float(np.median(distances)) / views[0].camera.fx
-    position, fall = _falls(cylinder, axis, end, inside, outside, pixel, views, others, basis, view_offset, blur)
-    if not len(position) or fall.max() < 0.0:
-        return None
     along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL, dtype=float)
-    slopes = [_slopes(axis, end, cylinder.radius, along, view) for view in views]
+    slopes = [_slopes(axis, end, cylinder.radius, along, view, others) for view in views]
     edges = np.concatenate(slopes) if slopes else np.zeros((0, len(along)))
     seen = np.isfinite(edges)
     if not seen.any():
@@ -69,50 +83,28 @@ def find_end(
     strength = np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0)
     count = seen.sum(axis=0)
     vote = strength.sum(axis=0) / (count + SECTORS)
-    score = np.interp(along, position, fall, left=-1.0, right=-1.0) + vote
-    score -= FAR_PENALTY * (along / outside) ** 2 + OUTER_PENALTY * np.maximum(along, 0.0) / outside
-    best = int(np.argmax(score))
-    if np.interp(along[best], position, fall) < 0.0:
-        return None
-    return _refined(strength, seen, along, best, pixel)
+    vote = np.where(count > 0, vote - np.median(vote[count > 0]), 0.0)
+    vote -= OUTER_PENALTY * np.maximum(along, 0.0) / outside
+    if surface_end is not None:
+        odds = odds - np.log1p(((position - surface_end) / SURFACE_SIGMA) ** 2)
+    likely = np.interp(along, position, odds) - float(odds.max())
+    score = np.where(likely > -PLAUSIBLE, likely + RIM_WORTH * vote, -np.inf)
+    return _refined(strength, seen, along, int(np.argmax(score)), pixel)
 
 
-def _falls(
-    cylinder: Cylinder,
-    axis: FloatArray,
-    end: FloatArray,
-    inside: float,
-    outside: float,
-    pixel: float,
-    views: Sequence[View],
-    others: Sequence[Cylinder],
-    basis: FloatArray,
-    view_offset: FloatArray,
-    blur: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Positions along `axis` from `end` and how much the support of the outlines falls there, -1 where too little."""
-    stretch = Cylinder(end - inside * axis, end + outside * axis, cylinder.radius)
-    at, edges = outline_edges(stretch, views, others, basis, view_offset, 1.5, blur, 6)
-    if not len(at):
-        return np.zeros(0), np.zeros(0)
-    profile = support_profile(at, hits(at, edges, view_offset))
-    position = profile.along + 0.5 * (outside - inside)
-    seen, found = profile.seen.sum(axis=1), profile.hits.sum(axis=1)
-    window = max(cylinder.radius, 30.0 * pixel)
-    fall = np.full(len(position), -1.0)
-    for index, here in enumerate(position):
-        before = (position > here - window) & (position <= here)
-        after = (position > here) & (position <= here + window)
-        if seen[before].sum() >= MIN_SEEN and seen[after].sum() >= MIN_SEEN:
-            inner, outer = (found[part].sum() / seen[part].sum() for part in (before, after))
-            if inner - outer >= min(MIN_FALL, MIN_SHARE * (inner + CHANCE)):
-                fall[index] = inner - outer
-    # The rim decides within the coarse step of the stations.
-    return position, maximum_filter1d(fall, 3)
+def _odds(evidence: Evidence, inside: float) -> tuple[FloatArray, FloatArray]:
+    """Places (M,) beyond `-inside` [m] and the logarithm of the odds, but for a constant, that the pipe ends there."""
+    step = float(evidence.along[1] - evidence.along[0])
+    place = np.append(evidence.along - 0.5 * step, evidence.along[-1] + 0.5 * step)
+    total = np.append(0.0, np.cumsum(np.where(evidence.seen > 0, evidence.log_odds, -UNSEEN)))
+    searched = place > -inside
+    return place[searched], total[searched]
 
 
-def _slopes(axis: FloatArray, end: FloatArray, radius: float, along: FloatArray, view: View) -> FloatArray:
-    """Derivative of the light along the axis (SECTORS, T) on the unrolled barrel; NaN outside the image."""
+def _slopes(
+    axis: FloatArray, end: FloatArray, radius: float, along: FloatArray, view: View, others: Sequence[Cylinder]
+) -> FloatArray:
+    """Derivative of the light along the axis (SECTORS, T) on the unrolled barrel; NaN outside the image or hidden."""
     towards = camera_centre(view) - end
     towards = towards - axis * (axis @ towards)
     towards = towards / np.linalg.norm(towards)
@@ -124,7 +116,10 @@ def _slopes(axis: FloatArray, end: FloatArray, radius: float, along: FloatArray,
     sharp = (
         (depth > 0.05) & (pixel > 2).all(axis=1) & (pixel[:, 0] < camera.width - 3) & (pixel[:, 1] < camera.height - 3)
     )
+    there, deep = pixel[sharp], depth[sharp]
+    sharp[sharp] = ~(hidden(view, there, deep, others) | behind(view, there, deep))
     inside = sharp.reshape(SECTORS, RAYS_PER_SECTOR, -1).all(axis=1)
+    inside = minimum_filter1d(inside, 2 * BESIDE_HIDDEN * SAMPLES_PER_PIXEL + 1, axis=1)
     if not inside.any():
         return np.full(inside.shape, np.nan)
     low = np.maximum(np.floor(pixel[sharp].min(axis=0)).astype(int) - 2, 0)
