@@ -29,9 +29,8 @@ KABSCH_ROUNDS = 3  # more move the median by less than a pixel of the full image
 
 
 def sharpness(gray: GrayImage) -> float:
-    """Variance of the Laplacian; comparable among neighbouring frames only."""
-    deviation = cv2.meanStdDev(cv2.Laplacian(gray, cv2.CV_16S))[1]
-    return float(deviation[0, 0]) ** 2
+    """Variance of the Laplacian, whose mean is zero; comparable among neighbouring frames only."""
+    return cv2.norm(cv2.Laplacian(gray, cv2.CV_16S)) ** 2 / gray.size
 
 
 def corners(gray: GrayImage) -> PointArray:
@@ -140,4 +139,4 @@ class Tracker:
             difference = current - reference @ (u @ vt).T
             residual = np.sqrt(np.einsum("ij,ij->i", difference, difference))
             weights = 1.0 / np.maximum(residual, 1e-4)
-        return float(np.median(residual)) * self._camera.fx
+        return float(np.partition(residual, len(residual) // 2)[len(residual) // 2]) * self._camera.fx
