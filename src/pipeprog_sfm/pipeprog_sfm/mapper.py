@@ -14,6 +14,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_sfm.colmap import AbsolutePose, absolute_pose, relative_pose
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features import Features, extract
+from pipeprog_sfm.loop import bend, shares
 from pipeprog_sfm.matching import MatchArray, match, match_guided
 from pipeprog_sfm.model import SparseModel
 
@@ -37,6 +38,8 @@ RIVAL = 0.5  # of a pose's inliers: as many that agree on another pose make it a
 RETRIEVED = 6  # views of a model that a lost keyframe is compared with, others each time: the cost stays bounded
 ALIKE = 3  # of these that are matched in full
 GLANCE = 400  # features that such a comparison takes
+GLANCED = MIN_INLIERS * GLANCE // COARSE  # matches of so few features that make a full comparison worth while
+MAX_DRIFT = 0.05  # of the way since: what exceeds it is no drift but another place that looks alike
 RETRIES = 3  # waiting keyframes tried again with each new one
 START_CANDIDATES = 8  # waiting keyframes that a new one may start a model with
 REMEMBERED = 100  # retired keyframes whose features are kept for when they are called for again: 60 MB
@@ -167,6 +170,7 @@ class Mapper:
             if not self._start(keyframe):
                 return report
         self._retry(stamp)
+        self._close(stamp)
         if len(self._models) > 1:
             self._merge(stamp)
         return self._report(stamp)
@@ -238,6 +242,8 @@ class Mapper:
                     self._waiting.remove(stamp)
             if len(self._waiting) >= before:
                 break
+        for stamp in [stamp for model in sorted(self._models, key=len)[:-1] for stamp in model.stamps]:
+            self._merge(stamp)
         for model in self._models:
             self._adjust_globally(model)
 
@@ -352,12 +358,19 @@ class Mapper:
 
     def _alike(self, model: SparseModel, keyframe: _Keyframe) -> IntArray:
         """Views, out of the few that it is the turn of, that share most of the strongest features."""
-        count = min(RETRIEVED, len(model))
-        views = (self._cursor + np.arange(count) * max(len(model) // RETRIEVED, 1)) % len(model)
+        return self._resembling(model, keyframe, self._turn(len(model)), 1)
+
+    def _turn(self, count: int) -> IntArray:
+        """The few out of `count` that it is the turn of, spread evenly; others each time."""
+        chosen = (self._cursor + np.arange(min(RETRIEVED, count)) * max(count // RETRIEVED, 1)) % count
         self._cursor += 1
+        return chosen
+
+    def _resembling(self, model: SparseModel, keyframe: _Keyframe, views: IntArray, least: int) -> IntArray:
+        """Those views that share most of the strongest features, and at least so many."""
         found = [len(self._matched(keyframe, self._keyframes[model.stamps[view]], GLANCE)) for view in views]
         order = np.argsort(-np.array(found), kind="stable")[:ALIKE]
-        return views[order][np.array(found)[order] > 0]
+        return views[order][np.array(found)[order] >= least]
 
     def _matched(self, keyframe: _Keyframe, other: _Keyframe, count: int | None) -> MatchArray:
         """Matches of the `count` strongest features (None: of all) of two keyframes, found once."""
@@ -564,21 +577,49 @@ class Mapper:
             location = self._locate(other, keyframe, alike, None)
             if location.camera_from_model is None:
                 continue
-            view = own.stamps.index(stamp)
-            used = location.pairs
-            mine = own.point_of[own.offsets[view] + used[:, 0]]
-            used, mine = used[mine >= 0], mine[mine >= 0]
-            own_pose = own.pose(view)
-            depth = own.points[mine] @ own_pose[2, :3] + own_pose[2, 3]
-            pose = location.camera_from_model
-            ratio = (other.points[used[:, 1]] @ pose[2, :3] + pose[2, 3]) / depth
-            scale = float(np.median(ratio)) if len(ratio) else 0.0
-            if scale <= 0 or (np.abs(ratio / scale - 1) < DEPTH_TOLERANCE).sum() < MIN_INLIERS:
+            relation = _relation(own, own.stamps.index(stamp), other, location)
+            if relation is None:
                 continue
-            own_pose[:3, 3] *= scale
-            other_from_own = np.linalg.inv(pose) @ own_pose
+            scale, other_from_own = relation
             self._join(own, other, scale, other_from_own, stamp)
             return
+
+    def _close(self, stamp: int) -> None:
+        """Closes a loop: where the keyframe is back at known ground that its points are not tied to, these are one.
+
+        A keyframe that already shares points with views of long ago is where it seems to be.
+        """
+        model = self._model_of(stamp)
+        if model is None:
+            return
+        view = model.stamps.index(stamp)
+        rank = np.argsort(np.argsort(model.stamps))
+        old = np.abs(rank - rank[view]) > 2 * LOCAL_WINDOW
+        if not old.any() or (model.covisible(view)[old] >= MIN_INLIERS).any():
+            return
+        keyframe, known = self._keyframes[stamp], np.flatnonzero(old)
+        own = model.point_of[model.features(view)]
+        near = [other for other in self._partners(model, view, own[own >= 0]) if old[other]]
+        views = np.unique(np.r_[np.array(near, np.int64), known[self._turn(len(known))]])
+        alike = self._resembling(model, keyframe, views, GLANCED)
+        if not len(alike):
+            return
+        location = self._locate(model, keyframe, alike, None)
+        relation = None if location.camera_from_model is None else _relation(model, view, model, location)
+        if relation is None:
+            return
+        scale, correction = relation
+        order = np.argsort(model.stamps)
+        between = order[min(rank[view], rank[alike[0]]) : max(rank[view], rank[alike[0]]) + 1]
+        way = np.linalg.norm(np.diff(model.centres()[between], axis=0), axis=1).sum()
+        centre = model.centre(view)
+        drift = np.linalg.norm(correction[:3, :3] @ centre * scale + correction[:3, 3] - centre)
+        if drift > MAX_DRIFT * way:
+            return
+        bend(model, shares(model, alike, view), scale, correction)
+        for other in order[max(rank[view] - LOCAL_WINDOW, 0) : rank[view] + LOCAL_WINDOW]:
+            self._link(model, int(other))
+        self._adjust_globally(model)
 
     def _join(
         self, source: SparseModel, target: SparseModel, scale: float, target_from_source: FloatArray, stamp: int
@@ -628,6 +669,27 @@ def _keyframe(stamp: int, features: Features, camera: Camera) -> _Keyframe:
 def _forget_oldest(known: dict[Any, Any], limit: int) -> None:
     while len(known) > limit:
         del known[next(iter(known))]
+
+
+def _relation(
+    source: SparseModel, view: int, target: SparseModel, location: _Location
+) -> tuple[float, FloatArray] | None:
+    """Scale and rigid target_from_source (4, 4) by a view of the source that was located in the target.
+
+    None where the depths of the points that both see through this view do not agree.
+    """
+    used = location.pairs
+    mine = source.point_of[source.offsets[view] + used[:, 0]]
+    used, mine = used[mine >= 0], mine[mine >= 0]
+    own_pose, pose = source.pose(view), location.camera_from_model
+    assert pose is not None
+    depth = source.points[mine] @ own_pose[2, :3] + own_pose[2, 3]
+    ratio = (target.points[used[:, 1]] @ pose[2, :3] + pose[2, 3]) / depth
+    scale = float(np.median(ratio)) if len(ratio) else 0.0
+    if scale <= 0 or (np.abs(ratio / scale - 1) < DEPTH_TOLERANCE).sum() < MIN_INLIERS:
+        return None
+    own_pose[:3, 3] *= scale
+    return scale, np.linalg.inv(pose) @ own_pose
 
 
 def _poses(model: SparseModel) -> dict[int, FloatArray]:

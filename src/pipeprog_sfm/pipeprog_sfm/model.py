@@ -77,6 +77,10 @@ class SparseModel:
         """(V, 3) projection centres."""
         return -np.einsum("vji,vj->vi", self.rotation, self.translation)
 
+    def centre(self, view: int) -> FloatArray:
+        """(3,) projection centre of one view."""
+        return -self.rotation[view].T @ self.translation[view]
+
     def add_view(self, stamp: int, rays: FloatArray, focal: FloatArray, camera_from_model: FloatArray) -> int:
         """Adds a registered view and returns its index."""
         begin, end = self.offsets[-1], self.offsets[-1] + len(rays)
