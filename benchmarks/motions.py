@@ -12,13 +12,12 @@ import sys
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from benchmarks.recordings import ROOT
 from benchmarks.survey import RESULTS
@@ -36,7 +35,7 @@ sys.path.insert(0, str(ROOT / "bags"))
 from sitegen.lab import build_lab
 from sitegen.render import Lens, Scene, build_scene
 from sitegen.sensor import Sensor, compress, develop, expose
-from sitegen.walk import look
+from sitegen.walk import Walk, look
 
 FloatArray = NDArray[np.float64]
 Recorded = list[tuple[int, bytes]]
@@ -54,16 +53,16 @@ NOISE = 1.0  # grey level
 SECOND = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class Path:
+class Path(Walk):
     """Straight ways between (t, x, y, yaw) of the carrier's axis: s, m, rad; yaw turns left from +y."""
 
-    corners: tuple[tuple[float, float, float, float], ...]
+    def __init__(self, *corners: tuple[float, float, float, float]) -> None:
+        self._corners = np.array(corners)
 
-    def poses(self, seconds: FloatArray) -> FloatArray:
+    def poses(self, seconds: ArrayLike) -> FloatArray:
         """(N, 4, 4) world_from_camera at (N,) times."""
-        t = np.atleast_1d(seconds)
-        keys = np.array(self.corners)
+        t = np.atleast_1d(np.asarray(seconds, float))
+        keys = self._corners
         x, y, yaw = (np.interp(t, keys[:, 0], keys[:, column]) for column in (1, 2, 3))
         sway = SWAY * np.sin(2 * np.pi * np.outer(t, [0.83, 1.1, 1.73]))
         yaw = yaw + sway[:, 2]
@@ -71,9 +70,9 @@ class Path:
         return look(place, yaw, sway[:, 0], sway[:, 1])
 
 
-ALONG = Path(((0.0, 0.5, -2.3, 0.0), (6.0, 0.5 + 6 * SPEED, -2.3, 0.0)))
-BACK = Path(((0.0, 0.5 + 3 * SPEED, -2.35, 0.0), (3.0, 0.5, -2.4, 0.0)))
-TURN = Path(((0, 0.5, -2.3, 0), (1.5, 1.6, -2.3, 0), (2.5, 1.6, -2.3, np.pi / 2), (4.0, 1.6, -3.4, np.pi / 2)))
+ALONG = Path((0.0, 0.5, -2.3, 0.0), (6.0, 0.5 + 6 * SPEED, -2.3, 0.0))
+BACK = Path((0.0, 0.5 + 3 * SPEED, -2.35, 0.0), (3.0, 0.5, -2.4, 0.0))
+TURN = Path((0, 0.5, -2.3, 0), (1.5, 1.6, -2.3, 0), (2.5, 1.6, -2.3, np.pi / 2), (4.0, 1.6, -3.4, np.pi / 2))
 
 
 def turn() -> Recorded:
@@ -86,7 +85,7 @@ def stop() -> Recorded:
     """A walk of 2 s, a stop of 20 s at 10 frames a second with a hand's tremor, and on."""
     frames = _rendered("along", ALONG, np.arange(0, 6, 1 / FPS))
     before, after = frames[: int(2 * FPS)], frames[int(2 * FPS) :]
-    still = _decoded(before[-1][1])
+    still = _decoded(before[-1][1], cv2.IMREAD_COLOR)
     rng = np.random.default_rng(SEED)
     held = []
     for n in range(200):
@@ -148,8 +147,7 @@ def survive(frames: Recorded) -> dict[str, Any]:
             decision = changes.popleft()
             if decision.chosen:
                 keyframes.add(decision.stamp)
-                gray = cv2.imdecode(np.frombuffer(images[decision.stamp], np.uint8), cv2.IMREAD_GRAYSCALE)
-                mapper.add(decision.stamp, gray, CAMERA)
+                mapper.add(decision.stamp, _decoded(images[decision.stamp], cv2.IMREAD_GRAYSCALE), CAMERA)
             else:
                 keyframes.discard(decision.stamp)
                 mapper.retire([decision.stamp])
@@ -182,7 +180,7 @@ def _ties(mapper: Mapper) -> list[Tie]:
     ]
 
 
-def _rendered(name: str, path: Path, times: FloatArray) -> Recorded:
+def _rendered(name: str, path: Path, times: NDArray[Any]) -> Recorded:
     """Frames of the lab along a path, from out/motions where they are known."""
     kept = KEPT / f"{name}.npz"
     if not kept.exists():
@@ -202,9 +200,10 @@ def _frame(scene: Scene, path: Path, sensor: Sensor, time: float) -> bytes:
     return compress(develop(expose(scene, LENS, path, sensor, time), sensor, rng), sensor)
 
 
-def _decoded(encoded: bytes) -> NDArray[np.uint8]:
-    image: NDArray[np.uint8] = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
-    return image
+def _decoded(encoded: bytes, flags: int) -> NDArray[np.uint8]:
+    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)
+    assert image is not None
+    return image.astype(np.uint8, copy=False)
 
 
 def _encoded(image: NDArray[np.uint8], rng: np.random.Generator) -> bytes:
