@@ -78,7 +78,7 @@ def _choose(run: Path, recording: Recording, errors: Errors, failures: Counter[t
     detected = json.loads((run / "pipes.json").read_text())["pipes"]
     measured = next(entry["radius"] for entry in detected if entry["id"] == pipe["id"])
     for variant, corrected in VARIANTS.items():
-        tracker, poses = _tracked(run, recording.beside("board.yaml"), corrected)
+        tracker, poses = tracked(run, recording.beside("board.yaml"), corrected)
         seeing = list(poses)
         for views in track([count for count in VIEWS if count <= len(seeing)], f"{run.name}, centres {variant}"):
             rng = np.random.default_rng(views)
@@ -126,7 +126,7 @@ def _rms(errors: np.ndarray) -> float:
     return round(float(np.sqrt(np.mean(errors**2))), 4)
 
 
-def _tracked(run: Path, board: Path, corrected: bool) -> tuple[BoardTracker, dict[int, np.ndarray]]:
+def tracked(run: Path, board: Path, corrected: bool) -> tuple[BoardTracker, dict[int, np.ndarray]]:
     """The boards in the keyframes of a run, and the poses camera_from_map, by stamp, of those that see one."""
     bag = Bag.open(run / "out.mcap")
     config = dataclasses.replace(SfmConfig().board, eccentricity=corrected)
