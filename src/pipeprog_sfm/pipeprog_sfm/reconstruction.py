@@ -75,6 +75,7 @@ class Reconstruction:
 
     def __init__(self, config: SfmConfig, targets: Targets) -> None:
         self._mapper = Mapper(config.mapper, config.seed)
+        self._config = config
         self._deblurrer = Deblurrer(config, self._mapper)
         self._targets = BoardTracker(targets, config.board, config.odometry)
         self._images: dict[int, EncodedImage] = {}
@@ -200,7 +201,10 @@ class Reconstruction:
         self._pending = None
         points = cloud.result()
         if not len(points.points):
-            self._reason = "no surface has been seen from enough sides: walk past it, sideways"
+            self._reason = (
+                f"no surface is seen by {self._config.fusion.min_views} of {self._mapper.registered} keyframes alike: "
+                "walk past it, sideways, or have more keyframes chosen (frames.overlap_min)"
+            )
             raise NotMetricError(self._reason)
         return MetricMap(scale, trajectory, points)
 
