@@ -68,26 +68,7 @@ def pyransac3d(points: Points) -> list[Cylinder]:
     return found
 
 
-def cylfit(points: Points) -> list[Cylinder]:
-    """Repeated robust fits on the connected parts of what is left without the large planes."""
-    import cylfit as library
-
-    detected = library.detect_cylinders(
-        _without_planes(points),
-        max_cylinders=80,
-        threshold=EPSILON,
-        min_inliers=FEWEST,
-        min_inlier_fraction=0.3,
-        cluster_eps=SPACING,
-        random_state=0,
-    )
-    return [
-        {"start": each.model.start_point.tolist(), "end": each.model.end_point.tolist(), "radius": each.model.radius}
-        for each in detected
-    ]
-
-
-DETECTORS: dict[str, Callable[[Points], list[Cylinder]]] = {"cgal": cgal, "pyransac3d": pyransac3d, "cylfit": cylfit}
+DETECTORS: dict[str, Callable[[Points], list[Cylinder]]] = {"cgal": cgal, "pyransac3d": pyransac3d}
 
 
 def main(name: str, source: Path, target: Path) -> None:

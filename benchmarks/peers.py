@@ -4,7 +4,8 @@
 
 The peers are what the Python registry has as wheels; they get an environment of their own in out/peers-venv. What is
 measured is kept in out/peers, so that an interrupted run goes on. Those that would have to be built (PCL, Schnabel's
-engine, CylinderDetection) are quoted: they ran on other clouds, see `source`. Writes results/peers.json.
+engine, CylinderDetection) are quoted: they ran on other clouds, see `source`. cylfit 0.1.0 was tried, too, and had
+no result on a lab after ten minutes. Writes results/peers.json.
 """
 
 from __future__ import annotations
@@ -30,13 +31,11 @@ ENVIRONMENT = ROOT / "out" / "peers-venv"
 PACKAGES = (
     "cgal==6.0.1.post202410241521",
     "pyransac3d==0.7.0",
-    "cylfit==0.1.0",
     "numpy==2.2.6",
     "scipy==1.15.3",
 )
 PEERS = {
     "cgal": "CGAL 6.0.1, Efficient RANSAC",
-    "cylfit": "cylfit 0.1.0, repeated robust fits",
     "pyransac3d": "pyRANSAC-3D 0.7.0, repeated",
 }
 KEPT = ROOT / "out" / "peers"
