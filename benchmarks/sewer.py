@@ -3,8 +3,9 @@
     .venv/bin/python -m benchmarks.sewer FOLDER
 
 FOLDER holds one folder a nominal diameter, named after it (`400mm_PVC_pipe/01.ply`). The planned sizes are 180, 195,
-200, 340 and 400 mm. The arc counts the sectors of 5 deg in which the found pipe shows points; scans in which no pipe
-is found are looked through by eye. Prints the table and writes results/sewer.json beside this file.
+200, 340 and 400 mm. The arc counts the sectors of 5 deg in which the found pipe shows points. Scans in which none is
+found show at most 165 deg of one, as a search for a cylinder of the known size tells. Prints the table and writes
+results/sewer.json beside this file.
 """
 
 from __future__ import annotations

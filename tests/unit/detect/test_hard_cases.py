@@ -223,6 +223,9 @@ def test_a_rounded_corner_is_no_pipe_and_hides_none(radius: float, with_normals:
 SEWERS = Bill(tuple(PipeClass(str(d), 5e-4 * d, 4.0, (1.0, 0.0, 0.0), 5e-6 * d) for d in (180, 195, 200, 340, 400)))
 
 
+CONCAVE = DetectConfig(concave=True)
+
+
 def sewer(diameter: float, arc_deg: float, seed: int = 0) -> Cloud:
     """A pipe of PVC from inside: a part of its bore, rougher away from the camera, a far end, and stray points."""
     rng = np.random.default_rng(seed)
@@ -251,10 +254,23 @@ def sewer(diameter: float, arc_deg: float, seed: int = 0) -> Cloud:
 def test_a_sewer_from_inside(diameter: int, arc_deg: float, with_normals: bool) -> None:
     cloud = sewer(diameter, arc_deg)
     cloud = cloud if with_normals else Cloud(cloud.points)
-    (pipe,) = detect(cloud, SEWERS, DetectConfig(concave=True))
+    (pipe,) = detect(cloud, SEWERS, CONCAVE)
     assert pipe.class_name == str(diameter)
     assert pipe.cylinder.radius == pytest.approx(0.5e-3 * diameter * (1 - 2 / 38), abs=1.5e-3)
     assert pipe.cylinder.length > 0.15
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_torn_sewer_from_inside(seed: int) -> None:
+    """Half-dark: one wall is seen well, of the rest only shreds of a few centimetres, a fifth of them."""
+    cloud = sewer(400, 240, seed).points
+    wall, rest = cloud[:40_000], cloud[40_000:]
+    angle, depth = np.degrees(np.arctan2(wall[:, 1], wall[:, 0])), -wall[:, 2]
+    shred = np.floor((angle + 180) / 10).astype(int) * 100 + np.floor(depth / 0.04).astype(int)
+    lit = np.random.default_rng([seed, 1]).random(shred.max() + 1) < 0.2
+    (pipe,) = detect(Cloud(np.concatenate([wall[(np.abs(angle + 150) < 25) | lit[shred]], rest])), SEWERS, CONCAVE)
+    assert pipe.class_name == "400"
+    assert pipe.cylinder.radius == pytest.approx(0.2 * (1 - 2 / 38), abs=2e-3)
 
 
 def test_from_outside_a_hollow_is_no_pipe_and_from_inside_a_pipe_is_none() -> None:
@@ -264,12 +280,12 @@ def test_from_outside_a_hollow_is_no_pipe_and_from_inside_a_pipe_is_none() -> No
     cloud = scene.cloud()
     planned = Bill((PipeClass("168", 0.0841, 4.0, (1.0, 0.0, 0.0), 5e-4),))
     assert len(detect(cloud, planned, DetectConfig())) == 1
-    assert detect(cloud, planned, DetectConfig(concave=True)) == []
+    assert detect(cloud, planned, CONCAVE) == []
 
 
 def test_an_empty_sewer_tells_nothing() -> None:
     stray = np.random.default_rng(1).uniform(-1.0, 1.0, (5000, 3))
-    assert detect(Cloud(stray), SEWERS, DetectConfig(concave=True)) == []
+    assert detect(Cloud(stray), SEWERS, CONCAVE) == []
 
 
 def test_the_same_cloud_in_another_order_gives_the_same_pipes() -> None:
