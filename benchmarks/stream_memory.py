@@ -2,8 +2,8 @@
 
     .venv/bin/python -m benchmarks.stream_memory [BAG.mcap] [--minutes 10]
 
-A few dozen frames of a recording, enlarged to 4K with the noise of a sensor, come again and again, forth and back, so
-that the view moves all the time. Writes results/stream_memory.json.
+A few dozen frames of a recording, enlarged to 4K with the noise of a sensor, come again and again, there and back, at
+the pace at which they were recorded. Writes results/stream_memory.json.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import made, named
 from benchmarks.selector_cost import enlarged
-from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
@@ -28,9 +27,11 @@ from pipeprog_frames.feedback import Tie
 from pipeprog_frames.ring import Frame, FrameRing
 from pipeprog_frames.stream import Stream
 
+RESULTS = Path(__file__).parent / "results"
 WIDTH = 3840
 CYCLE = 32  # frames, of some 1.5 MB each
 FPS = 30
+REPEATED = 6  # times, each of them: the recording has 5 frames a second
 SECOND = 1_000_000_000
 
 
@@ -56,7 +57,7 @@ def main() -> None:
     for number in range(arguments.minutes * 60 * FPS):
         stamp = SECOND + number * SECOND // FPS
         # As a message's bytes: a copy of their own.
-        encoded = bytes(bytearray(images[there_and_back[number % len(there_and_back)]]))
+        encoded = bytes(bytearray(images[there_and_back[number // REPEATED % len(there_and_back)]]))
         ring.add(Frame(stamp, "camera", encoded, camera))
         for decision in stream.consider(stamp, partial(decode_reduced, encoded, camera.width)):
             if decision.chosen:
