@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from pipeprog_detect.edges import LINEAR_LIGHT
@@ -81,15 +82,25 @@ def find_end(
         return None
     typical = float(np.median(np.abs(edges[seen])))
     strength = np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0)
-    count = seen.sum(axis=0)
-    vote = strength.sum(axis=0) / (count + SECTORS)
-    vote = np.where(count > 0, vote - np.median(vote[count > 0]), 0.0)
+    vote = _all_around(strength, seen)
     vote -= OUTER_PENALTY * np.maximum(along, 0.0) / outside
     if surface_end is not None:
         odds = odds - np.log1p(((position - surface_end) / SURFACE_SIGMA) ** 2)
     likely = np.interp(along, position, odds) - float(odds.max())
     score = np.where(likely > -PLAUSIBLE, likely + RIM_WORTH * vote, -np.inf)
     return _refined(strength, seen, along, int(np.argmax(score)), pixel)
+
+
+def _all_around(strength: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
+    """How much stronger than elsewhere the edges (V * SECTORS, T) of all sectors are at each place (T,).
+
+    Texture has edges in some sectors: the weaker half of them counts. Where nothing is seen it is 0.
+    """
+    count = seen.reshape(-1, SECTORS, seen.shape[1]).sum(axis=0)
+    mean = strength.reshape(-1, SECTORS, seen.shape[1]).sum(axis=0) / (count + 1.0)
+    vote = np.sort(mean, axis=0)[: SECTORS // 2].mean(axis=0)
+    shown = count.min(axis=0) > 0
+    return np.where(shown, vote - np.median(vote[shown]), 0.0) if shown.any() else np.zeros(len(vote))
 
 
 def _odds(evidence: Evidence, inside: float) -> tuple[FloatArray, FloatArray]:
