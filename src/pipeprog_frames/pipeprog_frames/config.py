@@ -52,7 +52,7 @@ class FramesConfig:
         },
     )
     buffer_mib: int = field(
-        default=256,
+        default=192,
         metadata={
             "description": "memory for compressed frames that the feedback of the SfM may still call for; "
             "a replay keeps them all, in a temporary file",
