@@ -100,9 +100,10 @@ def _measured(tree: Octree, start: Cylinder, stretch: float, sigma: float, confi
         half = stretch * cylinder.radius * cylinder.axis
         cylinder = Cylinder(middle - half, middle + half, cylinder.radius)
         points = tree.points[tree.near_segment(cylinder.start, cylinder.end, 1.5 * cylinder.radius)]
-        candidate = settle(points, cylinder, wide, whole=True)
-        if candidate is None:
+        settled = settle(points, cylinder, wide, whole=True)
+        if settled is None:
             return None
+        candidate = settled
         change = abs(candidate.cylinder.radius - cylinder.radius)
         cylinder, wide = candidate.cylinder, min(candidate.band, most)
         if change < 0.5 * candidate.radius_sigma:
