@@ -4,8 +4,8 @@
 
 The peers are what the Python registry has as wheels; they get an environment of their own in out/peers-venv. What is
 measured is kept in out/peers, so that an interrupted run goes on. Those that would have to be built (PCL, Schnabel's
-engine, CylinderDetection) are quoted: they ran on other clouds, see `source`. cylfit 0.1.0 was tried, too, and had
-no result on a lab after ten minutes. Writes results/peers.json.
+engine, CylinderDetection) are quoted: they ran on other clouds, see `source`. cylfit 0.1.0 was tried, too, and
+stopped without a result on a lab after nine minutes on a busy machine. Writes results/peers.json.
 """
 
 from __future__ import annotations
