@@ -59,6 +59,9 @@ def main(minutes: float) -> None:
             {"minute": minute, "mean_ms": round(1e3 * near.mean(), 1), "median_ms": round(1e3 * np.median(near), 1)}
         )
     ratio = rows[-1]["mean_ms"] / rows[0]["mean_ms"]
+    whole = np.cumsum(spent)
+    ends = np.array([round(60 * row["minute"]) - 1 for row in rows])
+    exponent = np.polyfit(np.log(ends + 1), np.log(whole[ends]), 1)[0] if len(rows) > 1 else np.nan
     facts = {
         "registered": len(poses),
         "keyframes": count,
@@ -66,6 +69,7 @@ def main(minutes: float) -> None:
         "position_rmse_mm": round(
             1e3 * _rmse(np.array([_centre(pose) for pose in poses.values()]), truth[: len(poses)]), 2
         ),
+        "exponent_of_the_whole": round(float(exponent), 2),
         "ratio_of_means": round(float(ratio), 2),
         "memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
     }
