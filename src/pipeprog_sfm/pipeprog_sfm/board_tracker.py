@@ -31,7 +31,8 @@ class BoardTracker:
         self._config = config
         self._odometry = odometry
         self._camera: Camera | None = None
-        self._frame = ""
+        self._frame: str | None = None
+        self._frames: dict[int, str] = {}
         self._ellipses: dict[int, TargetEllipses] = {}
         self._observations: dict[int, list[BoardObservation]] = {}
         self._transforms = TransformTree()
@@ -43,10 +44,14 @@ class BoardTracker:
         Args:
             stamp: time of the keyframe [ns].
             gray: (H, W) uint8 image as the camera saw it: edges are measured before the lens distortion is removed.
-            camera: calibration, the same for every keyframe.
-            frame: name of the camera's optical frame.
+            camera: calibration, the same for every keyframe of one frame.
+            frame: name of the camera's optical frame; targets are measured with the first camera alone.
         """
-        self._frame = frame
+        self._frames[stamp] = frame
+        if self._frame is None:
+            self._frame = frame
+        if frame != self._frame:
+            return []
         self._camera = camera
         ellipses = find_ellipses(gray, camera, self._config)
         found = identify(ellipses, self._targets.boards, camera)
@@ -66,6 +71,7 @@ class BoardTracker:
         for stamp in stamps:
             self._ellipses.pop(stamp, None)
             self._observations.pop(stamp, None)
+            self._frames.pop(stamp, None)
 
     def estimate(
         self,
@@ -74,7 +80,7 @@ class BoardTracker:
         points: Callable[[], FloatArray] | None = None,
     ) -> ScaleEstimate:
         """Scale and map frame for (4, 4) poses camera_from_model by stamp; the rest as for `estimate_scale`."""
-        if self._camera is None:
+        if self._camera is None or self._frame is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
         evidence = Evidence(
             self._targets,
@@ -83,5 +89,6 @@ class BoardTracker:
             self._transforms,
             self._accelerations,
             self._frame,
+            self._frames,
         )
         return estimate_scale(evidence, poses, self._camera, self._config, self._odometry, covariance, points)

@@ -65,7 +65,7 @@ class BoardConfig:
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """Scale by odometry."""
+    """Scale by what a robot knows of its motion and of its body."""
 
     scale_sigma: float = field(
         default=0.01,
@@ -73,6 +73,14 @@ class OdometryConfig:
             "description": "relative standard deviation of the lengths that odometry tells, as it is calibrated",
             "unit": "",
             "range": (0.0, 0.2),
+        },
+    )
+    baseline_sigma: float = field(
+        default=0.0005,
+        metadata={
+            "description": "standard deviation of the distance between two cameras on one body, as /tf_static tells it",
+            "unit": "m",
+            "range": (0.0, 0.1),
         },
     )
 

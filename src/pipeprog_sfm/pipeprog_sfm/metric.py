@@ -18,6 +18,7 @@ from pipeprog_sfm.marks import MarksError, find_marks
 from pipeprog_sfm.motion import Acceleration, NoPathError, TransformTree
 from pipeprog_sfm.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.placement import BoardPlacement, PlacedBoard, contradiction, measure, place_boards, sensitivity
+from pipeprog_sfm.rig import rig_measurements
 from pipeprog_sfm.scale import (
     Measurement,
     NoScaleError,
@@ -42,6 +43,8 @@ class Evidence:
         transforms: odometry and TF.
         accelerations: of an IMU.
         camera_frame: name of the camera's optical frame.
+        frames: the same by stamp [ns], where images are of another camera than that one; it tells no more than where
+            it is mounted.
     """
 
     targets: Targets = Targets()  # noqa: RUF009  # frozen
@@ -50,6 +53,7 @@ class Evidence:
     transforms: TransformTree = field(default_factory=TransformTree)
     accelerations: Sequence[Acceleration] = ()
     camera_frame: str = ""
+    frames: Mapping[int, str] = field(default_factory=dict)
 
 
 def estimate_scale(
@@ -103,10 +107,18 @@ def estimate_scale(
         else:
             placed = {name: (place, sensitivity(place, poses, camera, config)) for name, place in ends.items()}
             measurements += [one for one in [distance_measurement(pair.distance, placed, stamps)] if one]
+    found, texts = rig_measurements(evidence.frames, evidence.transforms, poses, odometry)
+    measurements += found
+    warnings += texts
+    own = {
+        stamp: pose
+        for stamp, pose in poses.items()
+        if evidence.frames.get(stamp, evidence.camera_frame) == evidence.camera_frame
+    }
     path = None
     if evidence.transforms:
         try:
-            path = evidence.transforms.path(evidence.camera_frame, stamps)
+            path = evidence.transforms.path(evidence.camera_frame, list(own))
             measurements.append(odometry_measurement(path, poses, odometry))
         except (NoPathError, OdometryError) as error:
             warnings.append(str(error))
@@ -120,7 +132,7 @@ def estimate_scale(
     verticals: list[Vertical] = []
     if evidence.accelerations:
         try:
-            verticals.append(_gravity(evidence, poses, combined.scale))
+            verticals.append(_gravity(evidence, own, combined.scale))
         except (NoPathError, GravityError) as error:
             warnings.append(str(error))
     if origin is not None and config.upright:
@@ -152,8 +164,8 @@ def estimate_scale(
 
 def _gravity(evidence: Evidence, poses: Mapping[int, FloatArray], scale: float) -> Vertical:
     frames = {one.frame for one in evidence.accelerations}
-    turns = {frame: evidence.transforms.static_rotation(evidence.camera_frame, frame) for frame in frames}
-    forces = np.stack([turns[one.frame] @ one.force for one in evidence.accelerations])
+    turns = {frame: evidence.transforms.static_transform(evidence.camera_frame, frame) for frame in frames}
+    forces = np.stack([turns[one.frame][:3, :3] @ one.force for one in evidence.accelerations])
     return gravity(np.array([one.stamp for one in evidence.accelerations], np.int64), forces, poses, scale)
 
 

@@ -108,8 +108,8 @@ class TransformTree:
                 poses, covered = found @ poses, covered & known
         return Path(chain[-1], times[covered], poses[covered])
 
-    def static_rotation(self, to: str, source: str) -> FloatArray:
-        """(3, 3) rotation to_from_source of two frames mounted on one body; raises NoPathError."""
+    def static_transform(self, to: str, source: str) -> FloatArray:
+        """(4, 4) to_from_source of two frames mounted on one body; raises NoPathError."""
         above = {to: np.eye(4)}
         frame, pose = to, np.eye(4)
         while frame in self._static and self._static[frame].parent not in above:
@@ -126,7 +126,7 @@ class TransformTree:
             pose = self._static[frame].parent_from_child @ pose
             frame = self._static[frame].parent
             passed.add(frame)
-        return (np.linalg.inv(above[frame]) @ pose)[:3, :3]
+        return np.linalg.inv(above[frame]) @ pose
 
     def _parent(self, child: str) -> str:
         """The frame above, "" at the root; of several the one that was told most often."""

@@ -55,8 +55,8 @@ class SfmNode(Node):
         self._vain_starts = 0
         self._arguments = config, targets
         self._worker = self._start_worker()
-        self._images: dict[int, CompressedImage] = {}
-        self._cameras: dict[int, tuple[str, Camera]] = {}
+        self._images: dict[tuple[int, str], CompressedImage] = {}  # by stamp and frame, as the calibrations
+        self._cameras: dict[tuple[int, str], Camera] = {}
         self._frame_ids: dict[int, str] = {}
         self._retirements: deque[msg.KeyframesRetired] = deque()  # to be applied after the keyframes before them
         self._retiring: deque[msg.KeyframesRetired] = deque()  # at the worker
@@ -102,24 +102,27 @@ class SfmNode(Node):
         super().destroy_node()
 
     def _on_image(self, message: CompressedImage) -> None:
-        self._images[messages.stamp_ns(message.header.stamp)] = message
-        self._pair(messages.stamp_ns(message.header.stamp))
+        stamp, frame_id = messages.stamp_ns(message.header.stamp), message.header.frame_id
+        self._images[stamp, frame_id] = message
+        self._pair(stamp, frame_id)
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        stamp = messages.stamp_ns(message.header.stamp)
+        stamp, frame_id = messages.stamp_ns(message.header.stamp), message.header.frame_id
         try:
-            self._cameras[stamp] = (message.header.frame_id, messages.camera_from_info(message))
+            self._cameras[stamp, frame_id] = messages.camera_from_info(message)
         except InputError as error:
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        self._pair(stamp)
+        self._pair(stamp, frame_id)
 
-    def _pair(self, stamp: int) -> None:
+    def _pair(self, stamp: int, frame_id: str) -> None:
         """Hands a keyframe to the worker once image and calibration of one stamp are there."""
-        if stamp not in self._images or stamp not in self._cameras:
+        if (stamp, frame_id) not in self._images or (stamp, frame_id) not in self._cameras:
             return
-        image, (frame_id, camera) = self._images.pop(stamp), self._cameras.pop(stamp)
-        self._frame_ids[stamp] = frame_id
+        image, camera = self._images.pop((stamp, frame_id)), self._cameras.pop((stamp, frame_id))
+        # Cameras of one body may be triggered together: a nanosecond tells their images apart.
+        while self._frame_ids.setdefault(stamp, frame_id) != frame_id:
+            stamp += 1
         self._seen += 1
         self._last_stamp = max(self._last_stamp, stamp)
         if self._worker.backlog >= MAX_BACKLOG:

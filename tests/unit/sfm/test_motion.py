@@ -124,15 +124,15 @@ def test_a_camera_that_is_mounted_nowhere_is_told():
     with pytest.raises(NoPathError, match=r"moves base.*'camera' \(from which they lead to 'head'\).*/tf_static"):
         tree.path("camera", [0])
     with pytest.raises(NoPathError, match="'imu' with the camera's frame 'camera'"):
-        tree.static_rotation("camera", "imu")
+        tree.static_transform("camera", "imu")
 
 
-def test_static_rotation_over_a_common_body():
+def test_static_transform_over_a_common_body():
     rng = np.random.default_rng(0)
     tree, camera, imu = TransformTree(), random_pose(rng), random_pose(rng)
     tree.add([Transform(0, "base", "camera", camera, True), Transform(0, "base", "imu", imu, True)])
-    assert tree.static_rotation("camera", "imu") == pytest.approx((np.linalg.inv(camera) @ imu)[:3, :3])
-    assert tree.static_rotation("camera", "camera") == pytest.approx(np.eye(3))
+    assert tree.static_transform("camera", "imu") == pytest.approx(np.linalg.inv(camera) @ imu)
+    assert tree.static_transform("camera", "camera") == pytest.approx(np.eye(4))
 
 
 def path_of(robot, **arguments):
