@@ -1,12 +1,12 @@
 """The paper's Experiments 1 to 4 on generated sites: its figures, its method to the letter, and ours.
 
-    .venv/bin/python -m benchmarks.experiments [--methods paper ours] [--layouts lab field] [--size 720p]
+    .venv/bin/python -m benchmarks.experiments [--methods paper ours] [--layouts lab field] [--overlaps 95]
 
 Every survey goes through the node graph and is kept in out/surveys: a run that was interrupted goes on where it was,
 the survey that was under way is done again. After each survey the tables (results/experiment_table_1.json to 7) and
 figures (docs/images/experiment_figure_8 to 11) are written anew from all that is there. The sites with the highest
-overlap come first. The paper filmed in 4K; a lab takes half an hour to render in that size, a field site more than an
-hour, and each survey of them several times what it takes at 720p.
+overlap come first. `--size 4k` films as the paper did: rendering then takes some 25 minutes of one core for a lab and
+an hour for a field site, and each survey several times what it takes at 720p.
 """
 
 from __future__ import annotations
@@ -139,6 +139,7 @@ def main() -> None:
     parser.add_argument("--field-seeds", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--layouts", nargs="*", choices=list(OVERLAPS), default=list(OVERLAPS))
+    parser.add_argument("--overlaps", type=int, nargs="*", help="percent, of the paper's; without, all")
     arguments = parser.parse_args()
     recordings = {
         "lab": [site("lab", seed, f"--size={arguments.size}") for seed in arguments.lab_seeds],
@@ -151,7 +152,13 @@ def main() -> None:
         for method in METHODS
         for recording in recordings[layout]
     ]
-    due = [case for case in cases if case.method in arguments.methods and case.layout in arguments.layouts]
+    due = [
+        case
+        for case in cases
+        if case.method in arguments.methods
+        and case.layout in arguments.layouts
+        and (arguments.overlaps is None or round(100 * case.overlap) in arguments.overlaps)
+    ]
     for number, case in enumerate(due, 1):
         print(f"[{number} of {len(due)}] {case.name}", flush=True)
         if case.known() is None:

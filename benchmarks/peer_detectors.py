@@ -57,10 +57,10 @@ def pyransac3d(points: Points) -> list[Cylinder]:
 
     random.seed(0)
     rest, found = _without_planes(points), []
-    for _ in range(20):
+    for _ in range(12):
         if len(rest) < FEWEST:
             break
-        centre, axis, radius, inliers = library.Cylinder().fit(rest, EPSILON, 500)
+        centre, axis, radius, inliers = library.Cylinder().fit(rest, EPSILON, 300)
         if len(inliers) < FEWEST:
             break
         found.append(_cylinder(np.asarray(centre), np.asarray(axis), float(radius), rest[inliers]))
