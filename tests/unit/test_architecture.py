@@ -47,6 +47,7 @@ DEPENDENCIES = {
     "mcap": None,
     "mcap_ros2": None,
     "plyfile": None,
+    "pye57": None,
     "pycolmap": None,
     "pypcd4": None,
     "zstandard": None,

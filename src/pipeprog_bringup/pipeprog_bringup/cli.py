@@ -91,7 +91,7 @@ def replay(
 
 @app.command(rich_help_panel="From recordings")
 def detect(
-    cloud: Annotated[Path, typer.Argument(help="Metric point cloud: ply, pcd, las, laz, xyz, txt, csv, pts.")],
+    cloud: Annotated[Path, typer.Argument(help="Metric point cloud: ply, pcd, las, laz, e57, xyz, txt, csv, pts.")],
     boq: Boq,
     out: Out,
     force: Force = False,

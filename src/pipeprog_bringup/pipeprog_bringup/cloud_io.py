@@ -1,4 +1,4 @@
-"""Point clouds from files, and to them: PLY, PCD, LAS/LAZ and text, in metres."""
+"""Point clouds from files, and to them: PLY, PCD, LAS/LAZ, E57 and text, in metres."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class CloudFile:
 
 
 def read_cloud(path: Path) -> CloudFile:
-    """Read .ply, .pcd, .las, .laz, .xyz, .txt, .csv or .pts; raises InputError where there is no usable cloud in it."""
+    """Read .ply, .pcd, .las, .laz, .e57, .xyz, .txt, .csv, .pts; raises InputError where it holds no usable cloud."""
     if not path.is_file():
         raise InputError(f"no such cloud: {path}")
     reader = _READERS.get(path.suffix.lower())
@@ -173,6 +173,20 @@ def _read_las(path: Path) -> dict[str, NDArray]:
     return columns | {name: np.asarray(las[names[name]]) for group in _NORMALS for name in group if name in names}
 
 
+def _read_e57(path: Path) -> dict[str, NDArray]:
+    """The valid points of all scans, each moved by its pose into the file's common frame."""
+    import pye57
+
+    file = pye57.E57(str(path))
+    try:
+        scans = [file.read_scan(number, ignore_missing_fields=True) for number in range(file.scan_count)]
+    finally:
+        file.close()
+    if not scans:
+        raise InputError(f"{path} holds no scan: export the cloud again")
+    return {axis: np.concatenate([scan[f"cartesian{axis.upper()}"] for scan in scans]) for axis in "xyz"}
+
+
 def _read_text(path: Path) -> dict[str, NDArray]:
     """Columns of numbers (blanks, commas or semicolons between them), x y z first unless a line of names differs."""
     names, skipped, separator = ["x", "y", "z"], 0, None
@@ -215,6 +229,7 @@ _READERS: dict[str, Callable[[Path], dict[str, NDArray]]] = {
     ".pcd": _read_pcd,
     ".las": _read_las,
     ".laz": _read_las,
+    ".e57": _read_e57,
     ".xyz": _read_text,
     ".txt": _read_text,
     ".csv": _read_text,

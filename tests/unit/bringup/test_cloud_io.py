@@ -4,6 +4,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pye57
 import pytest
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
@@ -65,6 +66,22 @@ def test_las_holds_points_normals_and_colours(tmp_path: Path) -> None:
     assert np.max(las.red) <= 65535
     write_las(tmp_path / "again.las", POINTS, colors, vectors)
     assert (tmp_path / "again.las").read_bytes() == (tmp_path / "cloud.las").read_bytes()
+
+
+def test_e57_scans_come_together_by_their_poses(tmp_path: Path) -> None:
+    quarter, offset = np.sqrt([0.5, 0.0, 0.0, 0.5]), np.array([5.0, -2.0, 1.5])  # 90 deg about z
+    turned = (POINTS[300:] - offset) @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    file = pye57.E57(str(tmp_path / "cloud.e57"), mode="w")
+    for points, pose in ((POINTS[:300], {}), (turned, {"rotation": quarter, "translation": offset})):
+        file.write_scan_raw({f"cartesian{axis}": points[:, i].copy() for i, axis in enumerate("XYZ")}, **pose)
+    file.close()
+    np.testing.assert_allclose(read_cloud(tmp_path / "cloud.e57").cloud.points, POINTS, atol=1e-6)  # written as 32-bit
+
+
+def test_an_e57_file_without_a_scan_is_an_error(tmp_path: Path) -> None:
+    pye57.E57(str(tmp_path / "cloud.e57"), mode="w").close()
+    with pytest.raises(InputError, match="no scan"):
+        read_cloud(tmp_path / "cloud.e57")
 
 
 @pytest.mark.parametrize("encoding", list(Encoding))
