@@ -32,7 +32,7 @@ from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.selector import FrameSelector
 
 RESULTS = Path(__file__).parent / "results" / "selector_cost.json"
-ROUNDS = 5  # the least of them counts: other work on the machine only adds
+ROUNDS = 3  # the least of them counts: other work on the machine only adds
 ENLARGED = 40  # frames, of 1 MB each
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, MALLOC_LIMIT = -1, -3, 1 << 25  # of glibc's malloc; the largest limit
 

@@ -33,6 +33,7 @@ CYCLE = 32  # frames, of some 1.5 MB each
 FPS = 30
 REPEATED = 6  # times, each of them: the recording has 5 frames a second
 SECOND = 1_000_000_000
+TITLE = "Memory of the frame selector over a 4K stream at 30 Hz, ring of the default size"
 
 
 def main() -> None:
@@ -48,6 +49,7 @@ def main() -> None:
     camera = bag.camera.scaled(factor)
     there_and_back = [*range(CYCLE), *range(CYCLE - 2, 0, -1)]
 
+    command = f"python -m benchmarks.stream_memory {arguments.recording} --minutes {arguments.minutes}"
     config = FramesConfig()
     ring = FrameRing(config.buffer_mib << 20)
     stream = Stream(config, camera, ring.middle)
@@ -76,10 +78,8 @@ def main() -> None:
                 }
             )
             print(rows[-1], flush=True)
-    title = "Memory of the frame selector over a 4K stream at 30 Hz, ring of the default size"
-    command = f"python -m benchmarks.stream_memory {arguments.recording} --minutes {arguments.minutes}"
-    document = {"title": title, "command": command, "rows": rows}
-    (RESULTS / "stream_memory.json").write_text(json.dumps(document, indent=1) + "\n")
+            document = {"title": TITLE, "command": command, "rows": rows}
+            (RESULTS / "stream_memory.json").write_text(json.dumps(document, indent=1) + "\n")
 
 
 def _resident_mib() -> float:

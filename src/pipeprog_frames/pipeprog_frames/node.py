@@ -19,7 +19,7 @@ from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
 from pipeprog_frames.feedback import Tie
 from pipeprog_frames.network import Network
-from pipeprog_frames.ring import Frame, FrameFile, FrameRing
+from pipeprog_frames.ring import Frame, FrameFile, FrameRing, FrameStore
 from pipeprog_frames.selector import DAMAGED, Decision, Load
 from pipeprog_frames.stream import Stream
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
@@ -64,7 +64,7 @@ class FramesNode(Node):
         self._camera: Camera | None = None
         self._policy: Policy | None = None
         # In a replay the disk that holds the recording can hold its images, too.
-        self._ring = FrameFile() if self._config.lockstep else FrameRing(self._config.buffer_mib << 20)
+        self._ring: FrameStore = FrameFile() if self._config.lockstep else FrameRing(self._config.buffer_mib << 20)
         self._queue: deque[Image | CompressedImage] = deque()
         self._changes: deque[Frame | list[Decision]] = deque()  # keyframes to publish, keyframes to retire
         self._feedback: deque[ImageOverlapArray] = deque()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import mmap
 import tempfile
+from abc import ABC, abstractmethod
 from bisect import bisect_left
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 from pipeprog_camera.camera import Camera
@@ -25,27 +27,33 @@ class Frame:
     camera: Camera
 
 
-class FrameRing:
-    """Frames by stamp; the oldest go when their bytes exceed `capacity`."""
+class FrameStore(ABC):
+    """Frames by stamp."""
 
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self._frames: dict[int, Frame] = {}
-        self._bytes = 0
+    def __init__(self) -> None:
+        self._frames: dict[int, Frame] = {}  # without their bytes
+        self._places: dict[int, tuple[int, int]] = {}  # of these: start, length
+
+    @abstractmethod
+    def _write(self, encoded: bytes) -> int:
+        """Stores bytes and returns their start, having taken out those that were there."""
+
+    @abstractmethod
+    def _read(self, start: int, size: int) -> bytes:
+        """The bytes that were stored there."""
 
     def add(self, frame: Frame) -> None:
-        """Stores a frame whose stamp is later than all others; others are refused."""
+        """Stores a frame whose stamp is later than all others; others are refused. Raises InputError on a full disk."""
         if self._frames and frame.stamp <= next(reversed(self._frames)):
             return
-        self._frames[frame.stamp] = frame
-        self._bytes += len(frame.encoded)
-        while self._bytes > self._capacity and len(self._frames) > 1:
-            oldest = next(iter(self._frames))
-            self._bytes -= len(self._frames.pop(oldest).encoded)
+        start = self._write(frame.encoded)
+        self._frames[frame.stamp] = replace(frame, encoded=b"")
+        self._places[frame.stamp] = start, len(frame.encoded)
 
     def get(self, stamp: int) -> Frame | None:
         """The frame, if it is still held."""
-        return self._frames.get(stamp)
+        frame = self._frames.get(stamp)
+        return replace(frame, encoded=self._read(*self._places[stamp])) if frame is not None else None
 
     def look(self, stamp: int) -> GrayImage | None:
         """The frame, reduced and grey; None when it is gone, damaged or shows too little to be a keyframe."""
@@ -71,37 +79,67 @@ class FrameRing:
         return max(sharp, key=lambda stamp: sharp[stamp], default=None)
 
 
-class FrameFile(FrameRing):
+class FrameRing(FrameStore):
+    """The last frames, in `capacity` bytes of memory; the oldest are written over.
+
+    One piece of memory: pieces of all sizes that come and go would leave ever more gaps between them.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        super().__init__()
+        self._memory = mmap.mmap(-1, capacity)  # taken from the system as it is filled
+        self._end = 0
+
+    def _write(self, encoded: bytes) -> int:
+        size = len(encoded)
+        if size > len(self._memory):  # a frame larger than all of it is held alone
+            self._give_up(lambda start, end: True)
+            self._memory.close()
+            self._memory, self._end = mmap.mmap(-1, size), 0
+        if self._end + size > len(self._memory):
+            behind = self._end
+            self._give_up(lambda start, end: start >= behind)
+            self._end = 0
+        begin, self._end = self._end, self._end + size
+        self._give_up(lambda start, end: start < begin + size and end > begin)
+        self._memory[begin : begin + size] = encoded
+        return begin
+
+    def _give_up(self, is_in_the_way: Callable[[int, int], bool]) -> None:
+        """Forgets the oldest frames as long as they are in the way."""
+        while self._frames:
+            oldest = next(iter(self._frames))
+            start, size = self._places[oldest]
+            if not is_in_the_way(start, start + size):
+                return
+            del self._frames[oldest], self._places[oldest]
+
+    def _read(self, start: int, size: int) -> bytes:
+        return self._memory[start : start + size]
+
+
+class FrameFile(FrameStore):
     """Every frame of a recording; their bytes lie in a file that is gone with the process."""
 
     def __init__(self) -> None:
-        super().__init__(0)
+        super().__init__()
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the node lives
-        self._places: dict[int, tuple[int, int]] = {}
         self._end = 0
 
-    def add(self, frame: Frame) -> None:
-        """Stores a frame whose stamp is later than all others; others are refused. Raises InputError on a full disk."""
-        if frame.stamp in self._places:
-            return
-        super().add(replace(frame, encoded=b""))
-        self._file.seek(self._end)
+    def _write(self, encoded: bytes) -> int:
+        start = self._end
+        self._file.seek(start)
         try:
-            self._file.write(frame.encoded)
+            self._file.write(encoded)
             self._file.flush()
         except OSError as error:
             raise InputError(
                 f"the recording's images do not fit into a file in {tempfile.gettempdir()} ({error.strerror}): "
                 "make room there, or let TMPDIR name a folder that has it"
             ) from None
-        self._places[frame.stamp] = self._end, len(frame.encoded)
-        self._end += len(frame.encoded)
+        self._end += len(encoded)
+        return start
 
-    def get(self, stamp: int) -> Frame | None:
-        """The frame, if there is one of this stamp."""
-        frame = self._frames.get(stamp)
-        if frame is None:
-            return None
-        place, size = self._places[stamp]
-        self._file.seek(place)
-        return replace(frame, encoded=self._file.read(size))
+    def _read(self, start: int, size: int) -> bytes:
+        self._file.seek(start)
+        return self._file.read(size)
