@@ -99,15 +99,19 @@ def detect(
     plane: Annotated[
         str | None,
         typer.Option(
-            "--plane", help="Only the pipes that a plane through three points cuts.", metavar="'X,Y,Z X,Y,Z X,Y,Z'"
+            "--plane",
+            help="Only the pipes that a plane cuts: through three points, or a line on a keyframe of the survey whose "
+            "cloud.ply it is (keyframes count from 1, as in trajectory.tum).",
+            metavar="'X,Y,Z X,Y,Z X,Y,Z' | KEYFRAME:U1,V1,U2,V2",
         ),
     ] = None,
 ) -> None:
     """Find and classify the pipes of a metric point cloud."""
     from pipeprog_bringup.console import print_progress, share_bar
     from pipeprog_bringup.detecting import detect_file
+    from pipeprog_bringup.drawn_plane import as_points
 
-    cut = [] if plane is None else ["detect.front_end=planes", f"detect.plane={plane}"]
+    cut = [] if plane is None else ["detect.front_end=planes", f"detect.plane={as_points(plane, cloud.parent)}"]
     with share_bar("detect") as report:
         detection = detect_file(cloud, boq, out, [*cut, *(overrides or [])], force, report)
     if detection.dropped:
