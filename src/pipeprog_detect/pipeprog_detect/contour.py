@@ -41,7 +41,7 @@ CANDIDATES = 3
 COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
 MIN_STATIONS = 20
 # A pipe of which a piece is known is followed so many times, each time as far again.
-MAX_GROWTH = 4
+MAX_GROWTH = 6
 # Where more of it has so much less support, or another radius by so many standard deviations, what was known before
 # gives radius and axis.
 WORSE, SAME_RADIUS = 0.9, 3.0
@@ -84,15 +84,17 @@ def refine(
     follow: bool = True,
     known_radius: bool = False,
     depth_sigma: float = 0.0,
+    slope_sigma: float = np.inf,
     ends_known: bool = False,
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
     `initial_radius_sigma` [m] is the standard deviation of the given radius; that of the axis is taken as twice as
     much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the
-    pipe is made as long as its outlines are seen, and its ends are looked for. With `known_radius`
-    outlines of other radii are not looked for; `depth_sigma` [m] is what the distance from the cameras is known to,
-    where that is worse. With `ends_known` the surface was seen between the given ends.
+    pipe is made as long as its outlines are seen, and its ends are looked for. With `known_radius` outlines of other
+    radii are not looked for; `depth_sigma` [m] is what the distance from the cameras is known to, where that is worse,
+    and `slope_sigma` [rad] what the slope towards them is known to. With `ends_known` the surface was seen between the
+    given ends.
 
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
@@ -105,14 +107,16 @@ def refine(
     candidates = _vote(cylinder, expected, views, others, basis, planned_radii)
     if not len(candidates):
         return None
-    prior = np.zeros(5)
-    prior[:4] = 1.0 / (2.0 * initial_radius_sigma) ** 2
-    prior[[1, 3]] = 1.0 / max(2.0 * initial_radius_sigma, depth_sigma) ** 2
+    known_to = np.full(5, 2.0 * initial_radius_sigma)
+    known_to[[1, 3]] = max(2.0 * initial_radius_sigma, depth_sigma)
+    known_to[4] = np.inf
+    slope = np.array([0.0, -1.0, 0.0, 1.0, 0.0]) / (slope_sigma * cylinder.length)
+    prior = np.diag(1.0 / known_to**2) + np.outer(slope, slope)
     scene = (views, others, basis)
     still: FloatArray = np.zeros(len(views))
     blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, still, CHUNK)
     held = prior.copy()
-    held[4] = 1.0 / RADIUS_HELD**2 if known_radius else 0.0
+    held[4, 4] = 1.0 / RADIUS_HELD**2 if known_radius else 0.0
     trials = [_improved(cylinder, candidate, scene, blur, held) for candidate in candidates]
     step, _ = max(trials, key=lambda trial: trial[1])
     if known_radius:  # its own edges are found first, then they tell the radius
@@ -136,7 +140,7 @@ def refine(
         # There may be more of it that is of less use to measure it by.
         if again.share < WORSE * refined.share or changed > SAME_RADIUS * sigma:
             refined = replace(refined, cylinder=longer)
-            break
+            continue
         refined, basis = again, turned
         scene = (views, others, basis)
     if refined is None or refined.share < MIN_SUPPORT or refined.cylinder.radius <= 0:
@@ -267,7 +271,7 @@ def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far
 
     There may be more unknowns: as many as the Jacobian has columns.
     A wrong pose moves both outlines of a view together, which says nothing about the radius: the offsets' variance is
-    estimated from the views' scatter (expectation maximisation), so that with true poses they vanish. `prior` (5,) is
+    estimated from the views' scatter (expectation maximisation), so that with true poses they vanish. `prior` (5, 5) is
     the precision [1/m^2] of the start, from which `so_far` (5,) has led: where the views lie in a row along the pipe,
     only the cloud knows its distance.
 
@@ -294,9 +298,9 @@ def _solve(at: Stations, edges: LimbEdges, count: int, prior: FloatArray, so_far
         own = np.bincount(at.view, weight, count) + 1.0 / variance
         cross = np.stack([np.bincount(at.view, sign * weighted[:, k], count) for k in range(unknowns)], axis=1)
         right = np.bincount(at.view, sign * weight * seen, count)
-        normal = weighted.T @ jacobian - (cross / own[:, None]).T @ cross + np.diag(prior)
+        normal = weighted.T @ jacobian - (cross / own[:, None]).T @ cross + prior
         normal += np.diag(np.full(unknowns, 1e-9 * np.trace(normal)))
-        step = np.linalg.solve(normal, weighted.T @ seen - cross.T @ (right / own) - prior * so_far)
+        step = np.linalg.solve(normal, weighted.T @ seen - cross.T @ (right / own) - prior @ so_far)
         offset = (right - cross @ step) / own
         active = own > 2.0 / variance
         if active.any():
@@ -313,7 +317,7 @@ def _flatness(refined: _Refined, views: Sequence[View]) -> tuple[float, float]:
     """Share of a strip's displacement that is in the edges, beside a step of the cylinder, and its sigma."""
     strip = _as_strip(refined.at, refined.cylinder, views)
     widened = replace(refined.at, jacobian=np.column_stack([refined.at.jacobian, strip]))
-    solution = _solve(widened, refined.edges, len(views), np.zeros(6), np.zeros(6))
+    solution = _solve(widened, refined.edges, len(views), np.zeros((6, 6)), np.zeros(6))
     return float(solution.step[5]), float(np.sqrt(solution.covariance[5, 5]))
 
 

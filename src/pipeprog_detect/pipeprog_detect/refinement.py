@@ -14,8 +14,9 @@ from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import ContourFit, refine
 from pipeprog_detect.extent import Run
 from pipeprog_detect.memory import Memory
+from pipeprog_detect.outline import viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.ribbons import propose
+from pipeprog_detect.ribbons import DEPTH_SIGMA, laid, mean_centre, propose
 from pipeprog_detect.verify import Candidate, Evidence
 
 # Outlines of real pipes are supported along more than half of what is seen of them.
@@ -34,6 +35,8 @@ MOST_LOST, MOST_POINTS = 40, 600_000
 LINES_CONVINCING = 0.6
 # What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
+# Pipes that run within so much of one direction are laid parallel, to so much; two may be so by chance.
+NEARLY_PARALLEL, PARALLEL_SIGMA, LEAST_PARALLEL = np.radians(5.0), np.radians(0.3), 3
 # Shorter than so many radii a pair of lines may be a hanger, a clamp, or chance.
 SLENDER = 20.0
 # A strip's edges stay where they are, a cylinder's outlines do not: halfway between, by so many standard deviations.
@@ -96,8 +99,10 @@ class Jury:
                 continue
             # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate or a corner.
             doubtful = self.sits and (candidate.blurred or not trusted[number])
-            if fit is not None and doubtful and not self._is_planned(fit):
-                continue
+            if doubtful and (fit is None or not self._is_planned(fit)):
+                fit = self._of_planned_size(candidate, others)
+                if fit is None:
+                    continue
             if not doubtful:
                 fit = self._as_planned(fit, others)
             if fit is None:
@@ -132,6 +137,21 @@ class Jury:
                 return again
         return fit
 
+    def _of_planned_size(self, candidate: Candidate, others: Sequence[Cylinder]) -> ContourFit | None:
+        """The best seen fit of a planned size that the cloud allows, sought with that radius alone.
+
+        Lines beside a thin pipe, such as its shadow's, pass for its outlines where its size is left open.
+        """
+        reach = 3.0 * max(candidate.radius_sigma, candidate.evidence.noise)
+        sigma, fits = candidate.evidence.noise, []
+        for one in self._bill.classes:
+            if candidate.blurred and abs(one.outer_radius - candidate.cylinder.radius) < reach:
+                start = replace(candidate.cylinder, radius=one.outer_radius)
+                fit = refine(start, sigma, self._views, others, self._config, (), known_radius=True, ends_known=True)
+                if fit is not None and fit.support > CONVINCING and self._is_planned(fit):
+                    fits.append(fit)
+        return max(fits, key=lambda fit: fit.support, default=None)
+
     def measure_lost(
         self, points: NDArray[np.floating], thickest: float, found: Sequence[Measured]
     ) -> tuple[Measured, ...]:
@@ -151,19 +171,38 @@ class Jury:
                 continue
             fit = self._by_lines(proposed, known, thin, follow=False)
             if fit is not None:
-                fit = self._by_lines(replace(proposed, start=fit.cylinder.start, end=fit.cylinder.end), known, thin)
+                fit = self._followed(replace(fit.cylinder, radius=proposed.radius), points, known, thin)
             if fit is None or fit.cylinder.length < SLENDER * fit.cylinder.radius or _is_known(fit.cylinder, known):
                 continue
             lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma))
             known.append(fit.cylinder)
         return tuple(lost)
 
+    def _followed(
+        self, piece: Cylinder, points: NDArray[np.floating], known: Sequence[Cylinder], radii: Sequence[float]
+    ) -> ContourFit | None:
+        """The whole of a pipe of which a piece was found by its lines.
+
+        Its depth, which lines seen from one height leave open, is that of the cloud's points (N, 3) before the wall.
+        """
+        centre = mean_centre(piece, self._views)
+        at_depth = None if centre is None else laid(piece, points.astype(np.float32), centre)
+        depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * piece.radius
+        start, slope_sigma = _aligned(at_depth or piece, known, self._views)
+        return self._by_lines(start, known, radii, depth_sigma, slope_sigma)
+
     def _by_lines(
-        self, proposed: Cylinder, known: Sequence[Cylinder], radii: Sequence[float], follow: bool = True
+        self,
+        proposed: Cylinder,
+        known: Sequence[Cylinder],
+        radii: Sequence[float],
+        depth_sigma: float = LINE_DEPTH_SIGMA,
+        slope_sigma: float = np.inf,
+        follow: bool = True,
     ) -> ContourFit | None:
         """The fit of a pipe proposed by its lines, where it has the outlines of one and a planned size."""
         sigma, views = proposed.radius, self._views
-        fit = refine(proposed, sigma, views, known, self._config, radii, follow, True, LINE_DEPTH_SIGMA)
+        fit = refine(proposed, sigma, views, known, self._config, radii, follow, True, depth_sigma, slope_sigma)
         if fit is None or fit.support < LINES_CONVINCING or not self._is_planned(fit):
             return None
         return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
@@ -204,6 +243,25 @@ class Jury:
 def _is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
     """Whether the middle of the cylinder lies within a known one."""
     return any(_contains(other, 0.5 * (cylinder.start + cylinder.end)) for other in known)
+
+
+def _aligned(proposed: Cylinder, known: Sequence[Cylinder], views: Sequence[View]) -> tuple[Cylinder, float]:
+    """The cylinder as parallel to the known ones of nearly its direction as its image allows, and how sure [rad].
+
+    Seen from one height alone, a level pipe may as well slope towards the cameras: what else runs there tells.
+    """
+    axes = np.array([other.axis * np.sign(other.axis @ proposed.axis) for other in known]).reshape(-1, 3)
+    axes = axes[axes @ proposed.axis > np.cos(NEARLY_PARALLEL)]
+    if len(axes) < LEAST_PARALLEL:
+        return proposed, np.inf
+    middle = 0.5 * (proposed.start + proposed.end)
+    across = np.cross(proposed.axis, viewing_direction(proposed, views))
+    across = across / np.linalg.norm(across)
+    direction = np.median(axes, axis=0)
+    spread = float(np.median(np.linalg.norm(axes - direction, axis=1)))
+    direction = direction - (direction @ across) * across
+    half = 0.5 * proposed.length * direction / np.linalg.norm(direction)
+    return Cylinder(middle - half, middle + half, proposed.radius), max(spread, PARALLEL_SIGMA)
 
 
 def _seen(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:

@@ -29,6 +29,8 @@ OVERLAP = 0.3
 RELIEF_REACH = 4.0
 # The cloud is looked for so far before and behind a proposed axis [m].
 LAID_REACH = 0.3
+# Behind a thin pipe the cloud shows more of the wall than of it: so many percent of the points there are its own.
+FRONT = 10.0
 # Standard deviation of a hypothesis's depth, in radii of the pipe.
 DEPTH_SIGMA = 1.0
 # Hypotheses that are followed into all views.
@@ -110,11 +112,11 @@ def propose(
         elif len(found) < limit:
             found.append(cylinder)
             centres.append(np.mean([camera_centre(eyes[k].view) for k in np.flatnonzero(sees[:, best])], axis=0))
-    laid = [_laid(cylinder, points, centre) for cylinder, centre in zip(found, centres, strict=True)]
-    if not laid:
+    if not found:
         return []
-    radius = np.array([one.radius for one in laid])
-    axes = _Axes(np.stack([[one.start, one.end] for one in laid]), radius, DEPTH_SIGMA * radius)
+    found = [laid(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)]
+    radius = np.array([one.radius for one in found])
+    axes = _Axes(np.stack([[one.start, one.end] for one in found]), radius, DEPTH_SIGMA * radius)
     axes = _adjusted(axes, eyes, [_matches(axes, eye) for eye in eyes])
     return [Cylinder(ends[0], ends[1], float(radius)) for ends, radius in zip(axes.ends, axes.radius, strict=True)]
 
@@ -453,6 +455,18 @@ def _accumulate(
     right[rows] += gradient * (residual / sigma)[:, None]
 
 
+def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
+    """Mean projection centre (3,) of the views that show the cylinder's middle, None where none does."""
+    middle = 0.5 * (cylinder.start + cylinder.end)
+    centres = []
+    for view in views:
+        pixel, depth = project(view, middle[None])
+        size = np.array([view.camera.width, view.camera.height])
+        if depth[0] > 0.05 and (pixel > 0).all() and (pixel < size - 1).all():
+            centres.append(camera_centre(view))
+    return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
+
+
 def _covers(one: Cylinder, other: Cylinder, centre: FloatArray) -> bool:
     """Whether two cylinders look, from `centre`, like pieces of one: their depths are what is known worst."""
     axis, towards, side = _sight(one, centre)
@@ -485,8 +499,8 @@ def _sight(cylinder: Cylinder, centre: FloatArray) -> tuple[FloatArray, FloatArr
     return axis, towards, side
 
 
-def _laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) -> Cylinder:
-    """The cylinder at the depth of the nearest points (N, 3) that it hides from `centre`, where there are enough."""
+def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) -> Cylinder | None:
+    """The cylinder at the depth of the nearest points (N, 3) that it hides from `centre`; None where there are few."""
     axis, towards, side = _sight(cylinder, centre)
     depth = float((cylinder.start - centre) @ towards)
     offset = points - centre.astype(np.float32)
@@ -498,14 +512,14 @@ def _laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) -
     inner = (np.abs(aside) < 0.6 * cylinder.radius) & (place > 0) & (place < cylinder.length)
     bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
     cell = np.clip((place[inner] / cylinder.length * bins).astype(int), 0, bins - 1)
-    front = _by_bin(cell, far[inner], bins, 25.0)
+    front = _by_bin(cell, far[inner], bins, FRONT)
     known = np.isfinite(front)
     if known.sum() < 0.3 * bins:
-        return cylinder
+        return None
     slope, level = _robust_line((np.arange(bins)[known] + 0.5) / bins, 1.0 / front[known])
     inverse = np.array([level, level + slope])
     if (np.abs(depth * inverse - 1.0) > LAID_REACH * inverse).any():
-        return cylinder
+        return None
     ends = []
     for end, share in ((cylinder.start, 0.0), (cylinder.end, 1.0)):
         ray = end - centre

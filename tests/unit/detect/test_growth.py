@@ -7,12 +7,13 @@ import pytest
 
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import refine
-from pipeprog_detect.growth import grown
+from pipeprog_detect.growth import grown, outline_evidence
 from pipeprog_detect.pipe import Cylinder, View
 
 # The pipe of `pipe_views`.
 PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 END_TOLERANCE = 2e-3  # half a pixel
+STATIONS_TOLERANCE = 0.03  # outlines alone tell an end to two stations of 6 px
 
 
 @pytest.mark.parametrize("piece", [(0.0, 0.16), (0.12, 0.28), (0.24, 0.4)])
@@ -32,3 +33,27 @@ def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[Vie
     for views in (pipe_views, empty_views):
         same = grown(PIPE, views, [], np.zeros(len(views)), 0.5)
         assert same.length == pytest.approx(PIPE.length, abs=1e-9)
+
+
+def test_what_hides_a_pipe_does_not_end_it(pipe_views: list[View]) -> None:
+    """A rod, known to cross before the pipe, leaves a gap in what is seen of it."""
+    known = Cylinder(PIPE.start, PIPE.start + 0.16 * PIPE.axis, PIPE.radius)
+    crossing = PIPE.start + 0.24 * PIPE.axis + np.array([0.0, -0.15, 0.0])
+    rod = Cylinder(crossing - np.array([0.4, 0.0, 0.0]), crossing + np.array([0.4, 0.0, 0.0]), 0.03)
+    still = np.zeros(len(pipe_views))
+    once = grown(known, pipe_views, [rod], still, 0.5)
+    twice = grown(once, pipe_views, [rod], still, 0.5)
+    assert (twice.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=STATIONS_TOLERANCE)
+
+
+def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
+    short = Cylinder(PIPE.start, PIPE.end - 0.1 * PIPE.axis, PIPE.radius)
+    evidence = outline_evidence(short, True, 0.25, pipe_views, [], np.zeros(len(pipe_views)), 0.5)
+    assert evidence is not None
+    step = evidence.along[1] - evidence.along[0]
+    assert evidence.log_odds[(evidence.along > 0) & (evidence.along < 0.1 - step)].min() > 0
+    assert evidence.log_odds[evidence.along > 0.1 + step].sum() < 0
+
+
+def test_no_evidence_without_a_pipe(empty_views: list[View]) -> None:
+    assert outline_evidence(PIPE, True, 0.2, empty_views, [], np.zeros(len(empty_views)), 0.5) is None

@@ -9,7 +9,7 @@ from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import refine
 from pipeprog_detect.lines import ribbons, straight_edges
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.ribbons import propose
+from pipeprog_detect.ribbons import laid, mean_centre, propose
 
 # The pipe and the wall of `pipe_views`; the shadow on the wall is as wide as a pipe of this radius.
 PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
@@ -82,3 +82,36 @@ def test_outlines_of_a_strip_stay_where_they_are(pipe_views: list[View]) -> None
     up = np.array([0.0, 0.0, 0.2])
     strip = refine(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002, pipe_views, [PIPE], ContourConfig())
     assert strip is None or strip.flatness - 0.5 > -strip.flatness_sigma
+
+
+def test_a_thin_pipe_is_laid_at_the_depth_of_the_points_before_the_wall() -> None:
+    thin = Cylinder(PIPE.start, PIPE.end, 0.0086)
+    centre = np.array([0.0, -1.2, 0.0])
+    sparse = front_points(thin)[::7]
+    deep = np.array([0.0, 0.05, 0.0])
+    proposed = Cylinder(centre + 1.05 * (thin.start - centre) + deep, centre + 1.05 * (thin.end - centre), thin.radius)
+    found = laid(proposed, np.concatenate([wall_points(), sparse]).astype(np.float32), centre)
+    assert found is not None
+    for end, true in ((found.start, thin.start), (found.end, thin.end)):
+        assert end[1] == pytest.approx(true[1], abs=thin.radius)
+    assert laid(proposed, np.zeros((0, 3), np.float32), centre) is None
+
+
+def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:
+    centre = mean_centre(PIPE, pipe_views)
+    assert centre is not None
+    assert centre[1] < -0.5
+    far = np.array([50.0, 0.0, 0.0])
+    assert mean_centre(Cylinder(PIPE.start + far, PIPE.end + far, PIPE.radius), pipe_views) is None
+
+
+def test_a_known_slope_holds_what_one_height_leaves_open(pipe_views: list[View]) -> None:
+    """From cameras almost in a plane with the axis the slope towards them is seen badly; that is what is given."""
+    few = pipe_views[2:6]
+    sloping = Cylinder(PIPE.start + np.array([0.0, 0.02, 0.0]), PIPE.end, PIPE.radius)
+    free = refine(sloping, PIPE.radius, few, [], ContourConfig(), RADII, False, True, 0.03)
+    held = refine(sloping, PIPE.radius, few, [], ContourConfig(), RADII, False, True, 0.03, np.radians(0.05))
+    assert free is not None
+    assert held is not None
+    turned = [np.arccos(min(abs(float(fit.cylinder.axis @ sloping.axis)), 1.0)) for fit in (free, held)]
+    assert turned[1] < 0.5 * turned[0]
