@@ -104,7 +104,7 @@ class Case:
             truth = json.loads(self.recording.beside("truth.json").read_text())
             figures["pipes"] = [pipe["radius"] for pipe in truth["pipes"]]
         else:
-            figures["network"] = _network(RUNS / self.name, self.overlap)
+            figures["network"] = network(RUNS / self.name, self.overlap)
             figures["cloud"] = cloud_accuracy(self.recording, RUNS / self.name)
         self.kept.write_text(json.dumps(figures, indent=1) + "\n")
 
@@ -178,7 +178,7 @@ def main() -> None:
         board_views.main(runs)
 
 
-def _network(out: Path, overlap_min: float) -> dict[str, int]:
+def network(out: Path, overlap_min: float) -> dict[str, int]:
     """What the network of images is like, from the results of a replay."""
     with (out / "frames.csv").open() as stream:
         rows = [row for row in csv.DictReader(stream) if row["chosen"] == "1" and row["registered"] == "1"]

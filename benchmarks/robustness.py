@@ -61,9 +61,10 @@ class Shot:
         plain = site("lab", SEED, *options, *speed, *self.options, "--allow-hidden")
         if (self.noise, self.quality, self.focal_error, self.k1) == (0.0, None, 0.0, 0.0):
             return plain
-        return self._altered(made(plain))
+        return self.altered(made(plain))
 
-    def _altered(self, plain: Recording) -> Recording:
+    def altered(self, plain: Recording) -> Recording:
+        """The plain recording with these changes to its frames and its calibration, in a file beside it."""
         changes = {"noise": self.noise, "quality": self.quality, "focal-error": self.focal_error, "k1": self.k1}
         said = "_".join(f"{name}{value:g}" for name, value in changes.items() if value)
         target = plain.bag.with_name(f"{plain.name}_{said}.mcap")

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import experiments
+
+PIPES = [
+    {"true_radius": 0.0086, "radius_error_mm": 0.3, "length_error_percent": -1.0},
+    {"true_radius": 0.1095, "radius_error_mm": -0.4, "length_error_percent": 3.0},
+]
+DONE = {
+    "commit": "a",
+    "score": {"classification": {"true_positives": 2, "false_positives": 1, "false_negatives": 1}, "pipes": PIPES},
+    "truth": [{"radius": 0.0086}, {"radius": 0.1095}, {"radius": 0.1095}],
+    "network": {"images": 10},
+}
+FAILED = {"commit": "b", "failed": "no board", "pipes": [0.0086, 0.1095, 0.1095]}
+
+
+def test_a_survey_without_a_result_misses_all_pipes() -> None:
+    both: list[dict[str, Any]] = [DONE, FAILED]
+    assert experiments.RATES["precision"](both) == pytest.approx(2 / 3, abs=1e-3)
+    assert experiments.RATES["recall"](both) == pytest.approx(2 / 6, abs=1e-3)
+    assert experiments.RATES["accuracy"](both) == pytest.approx(2 / 7, abs=1e-3)
+    assert experiments.RATES["F"](both) == pytest.approx(4 / 9, abs=1e-3)
+
+
+def test_errors_are_of_the_pipes_found_together_and_by_radius() -> None:
+    # Root mean square of 0.3 and 0.4 mm; mean of the absolute 1 and 3 %.
+    assert experiments.RADIUS["radius RMSE [mm]"]([DONE, FAILED]) == pytest.approx(0.354, abs=1e-3)
+    assert experiments.LENGTH["length error [%]"]([DONE]) == pytest.approx(2.0)
+    assert experiments.RADIUS["radius RMSE of 8.6 mm [mm]"]([DONE]) == pytest.approx(0.3)
+    assert experiments.RADIUS["radius RMSE of 57.5 mm [mm]"]([DONE]) is None
+
+
+def test_means_leave_out_what_has_no_result() -> None:
+    assert experiments.NETWORK["images"]([DONE, FAILED]) == 10
+    assert experiments.NETWORK["sites"]([DONE, FAILED]) == "2, 1 without a result"
+
+
+def test_a_network_of_images_is_counted_against_the_band(tmp_path: Path) -> None:
+    rows = ["1,1,0.90,200", "1,1,0.80,100", "1,1,0.86,50", "1,0,0.99,0", "0,0,,"]
+    (tmp_path / "frames.csv").write_text("\n".join(["chosen,registered,overlap_n,tie_points", *rows]) + "\n")
+    assert experiments.network(tmp_path, 0.85) == {
+        "images": 3,
+        "tie points in images": 350,
+        "images below the band": 1,
+        "images above the band": 1,
+    }
