@@ -35,7 +35,7 @@ def test_a_wrong_calibration_leaves_the_frames_alone(plain: Recording) -> None:
 def test_noise_is_as_strong_as_said(plain: Recording) -> None:
     altered = Shot(noise=12.0, quality=100).altered(plain)
     one, other = (next(iter(Bag.open(recording.bag))) for recording in (plain, altered))
-    levels = [cv2.imdecode(np.frombuffer(_image(f.data), np.uint8), cv2.IMREAD_COLOR) for f in (one, other)]
+    levels = [np.asarray(cv2.imdecode(np.frombuffer(_image(f.data), np.uint8), cv2.IMREAD_COLOR)) for f in (one, other)]
     difference = levels[1].astype(float) - levels[0]
     # Clipping at black and white, and the JPEG's colour at half the size, take some of it away.
     assert 7.0 < difference.std() < 12.5
