@@ -228,6 +228,7 @@ class Mapper:
             if len(model) < 2:
                 self._waiting += model.stamps
                 self._models.remove(model)
+                self._revision += 1
             elif stamps:
                 model.filter(*model.observations(np.ones(len(model.points), bool)))
 

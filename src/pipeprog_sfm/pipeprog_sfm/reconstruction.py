@@ -20,7 +20,7 @@ from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense import DenseMapper, EncodedImage, centre
 from pipeprog_sfm.fusion import FusedCloud
-from pipeprog_sfm.mapper import FrameTie, KeyframeReport, Mapper
+from pipeprog_sfm.mapper import GROWTH, FrameTie, KeyframeReport, Mapper
 from pipeprog_sfm.motion import Motion
 from pipeprog_sfm.scale import NoScaleError, ScaleEstimate
 from pipeprog_sfm.target_file import Targets
@@ -83,6 +83,8 @@ class Reconstruction:
         self._pending: tuple[ScaleEstimate, Trajectory, Future[FusedCloud]] | None = None
         self._scale: ScaleEstimate | None = None
         self._scaled = -1  # revision of the map that the scale was estimated in
+        self._sightings = 0  # keyframes that show a target
+        self._due = 0.0  # sightings at which the scale is estimated again
         self._reason = "no keyframe has been registered yet"
         self._problem = ""
 
@@ -98,8 +100,7 @@ class Reconstruction:
             )
         self._images[stamp] = EncodedImage(encoded, camera)
         # Features and targets are measured in the image as it is: their points are undistorted, not resampled.
-        if self._targets.add(stamp, gray, camera, frame):
-            self._scaled = -1
+        self._sightings += bool(self._targets.add(stamp, gray, camera, frame))
         report = self._mapper.add(stamp, gray, camera)
         self._deblurrer.add(stamp, self._images[stamp])
         return report
@@ -128,7 +129,6 @@ class Reconstruction:
         self._dense.retire(stamps)
         for stamp in stamps:
             self._images.pop(stamp, None)
-        self._scaled = -1
 
     def finish(self) -> MetricMap:
         """Registers what still can be, adjusts everything, and makes the final map; raises NotMetricError."""
@@ -209,10 +209,12 @@ class Reconstruction:
         return MetricMap(scale, trajectory, points)
 
     def _metric(self) -> tuple[ScaleEstimate, Trajectory]:
-        """The scale, estimated again when the map has moved or a target was seen, and the metric poses."""
-        if self._scale is None or self._scaled != self._mapper.revision:
+        """The scale, estimated again when the map has moved or more of the targets was seen, and the metric poses."""
+        # Its cost grows with the map: a pose must not wait for it at every keyframe in sight of a board.
+        moved = self._scaled != self._mapper.revision
+        if self._scale is None or moved or self._sightings >= self._due:
             self._estimate_scale()
-            self._scaled = self._mapper.revision
+            self._scaled, self._due = self._mapper.revision, GROWTH * (self._sightings + 1)
         if self._scale is None:
             raise NotMetricError(self._reason)
         poses = {
