@@ -14,8 +14,8 @@ from pipeprog_detect.support import SupportProfile, hits, support_profile
 
 # A known length tells the direction well enough to look this far ahead, in its own lengths and in metres.
 AHEAD, FARTHEST = 1.0, 1.5
-# Pixels between the places looked at, and the stations that suffice for one end.
-SPACING, STATIONS = 6, 2400
+# Pixels between the places looked at, and the stations that suffice for one end, and for a rate beside it.
+SPACING, STATIONS, STATIONS_BESIDE = 6, 2400, 600
 # Pixels beside the pipe where texture alone is seen, and by how much the pipe's rate must surpass that.
 BESIDE, LEAST_CONTRAST = 4.0, 0.15
 # Where little is seen beside the pipe, texture is taken to show edges at this rate, as if so many had been looked at.
@@ -86,15 +86,15 @@ def outline_evidence(
     back = min(0.5 * cylinder.length, 0.5 * FARTHEST)
     basis = frame(cylinder, viewing_direction(cylinder, views))
 
-    def profile(aside: float, inner: float) -> tuple[SupportProfile | None, float]:
+    def profile(aside: float, inner: float, limit: int) -> tuple[SupportProfile | None, float]:
         shift = aside * basis[0]
         stretch = Cylinder(end - inner * axis + shift, end + ahead * axis + shift, cylinder.radius)
-        at, edges = outline_edges(stretch, views, others, basis, view_offset, TOLERANCE, blur, SPACING, STATIONS)
+        at, edges = outline_edges(stretch, views, others, basis, view_offset, TOLERANCE, blur, SPACING, limit)
         if not len(at):
             return None, 0.0
         return support_profile(at, hits(at, edges, view_offset)), float(np.median(at.gain))
 
-    on, gain = profile(0.0, back)
+    on, gain = profile(0.0, back, STATIONS)
     if on is None:
         return None
     along = on.along + 0.5 * (ahead - back)
@@ -102,7 +102,8 @@ def outline_evidence(
     if on.seen[known].sum() < MIN_SAMPLES:
         return None
     aside = 2.0 * cylinder.radius + BESIDE / gain
-    beside = [each for each in (profile(sign * aside, 0.0)[0] for sign in (-1.0, 1.0)) if each is not None]
+    flanks = [profile(sign * aside, 0.0, STATIONS_BESIDE)[0] for sign in (-1.0, 1.0)]
+    beside = [each for each in flanks if each is not None]
     found, looked = (sum(float(getattr(each, name).sum()) for each in beside) for name in ("hits", "seen"))
     chance = (found + TEXTURE * TEXTURE_SEEN) / (looked + TEXTURE_SEEN)
     rate = on.hits[known].sum(axis=0) / np.maximum(on.seen[known].sum(axis=0), 1.0)
