@@ -62,15 +62,16 @@ class Stage:
     patches: tuple[tuple[str, Callable[..., Any]], ...] = ()
 
 
-def _open_gate(radial: FloatArray, *_: Any) -> FloatArray:
-    return np.ones(len(radial))
+def _all_points(points: FloatArray, *_: Any) -> FloatArray:
+    return points
 
 
 def _no_end(*_: Any, **__: Any) -> None:
     return None
 
 
-NO_GATE = (("pipeprog_detect.fit._gate", _open_gate),)
+# What the normals let through: the sector of the circumference whose normals voted for the pipe.
+NO_GATE = (("pipeprog_detect.verify._facing", _all_points),)
 CLOUD_ALONE = replace(DetectConfig(), contour=replace(DetectConfig().contour, enabled=False))
 STAGES = {
     "all stages": Stage(),

@@ -63,6 +63,9 @@ HARMS = {
     "no gate by normals in the fit": Harm(
         "pipeprog_detect.fit._gate", lambda _: lambda radial, *_: np.ones(len(radial)), "detect"
     ),
+    "no sector of the normals in the detector": Harm(
+        "pipeprog_detect.verify._facing", lambda _: lambda points, *_: points, "detect"
+    ),
     "the mean of the errors for their root mean square": Harm(
         "pipeprog_bringup.score._rms", lambda _: lambda values: float(np.mean(np.abs(values))), "bringup/test_score.py"
     ),
