@@ -3,7 +3,8 @@
     .venv/bin/python -m benchmarks.front_ends [--seeds 21 22] [--noise-mm 1 3]
 
 The sites are the `lab` and `field` layouts of bags/, scanned from points on their walks: what a front end finds of
-each planned radius, what it finds that is none, and its time. `planes` is the paper's Algorithm 3 with planes placed
+each planned radius, how many radii lie within three of their stated standard deviations, what it finds that is none,
+and its time. `planes` is the paper's Algorithm 3 with planes placed
 by itself, `straightened` the same with its sections taken along the pipes. Prints a table and writes
 results/front_ends.json beside this file.
 """
@@ -14,6 +15,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,11 +98,15 @@ def measured(site: Site, cloud: Cloud, seen: list[bool], config: DetectConfig) -
     pipes = detect(cloud, bill, config)
     seconds = time.process_time() - started
     found = [segment(pipe.cylinder, pipe.id, pipe.class_name) for pipe in pipes]
-    return {"points": len(cloud.points), **judged(site, seen, found), "seconds": round(seconds, 1)}
+    sigmas = [pipe.radius_sigma for pipe in pipes]
+    return {"points": len(cloud.points), **judged(site, seen, found, sigmas), "seconds": round(seconds, 1)}
 
 
-def judged(site: Site, seen: list[bool], found: list[Segment]) -> dict[str, Any]:
-    """What detections with their classes are worth, held against the pipes that the cloud shows."""
+def judged(site: Site, seen: list[bool], found: list[Segment], sigmas: Sequence[float] = ()) -> dict[str, Any]:
+    """What detections with their classes are worth, held against the pipes that the cloud shows.
+
+    sigmas [m] are the stated standard deviations of their radii, where they state any.
+    """
     radii = site.planned_radii
     truth = [segment(Cylinder(pipe.start, pipe.end, pipe.radius), str(k)) for k, pipe in enumerate(site.pipes)]
     pairs = {k: j for k, j in match(found, truth).items() if seen[j]}
@@ -113,12 +119,14 @@ def judged(site: Site, seen: list[bool], found: list[Segment]) -> dict[str, Any]
     errors = [found[k].radius - truth[j].radius for k, j in pairs.items()]
     hit = [truth[j].radius for j in pairs.values()]
     visible = [pipe.radius for pipe, is_seen in zip(truth, seen, strict=True) if is_seen]
+    true = [abs(error) < 3.0 * sigmas[k] for k, error in zip(pairs, errors, strict=True)] if sigmas else []
     return {
         "pipes": sum(seen),
         "found": len(pairs),
         "false": len(false),
         "right_class": sum(found[k].class_name == f"{1e3 * truth[j].radius:g}" for k, j in pairs.items()),
         "radius_rmse_mm": round(1e3 * float(np.sqrt(np.mean(np.square(errors)))), 3) if errors else None,
+        **({"within_3_sigma": sum(true)} if sigmas else {}),
         "found_of": {f"{1e3 * radius:g}": f"{hit.count(radius)}/{visible.count(radius)}" for radius in radii},
     }
 

@@ -88,23 +88,11 @@ class Octree:
     def near_segment(self, start: FloatArray, end: FloatArray, distance: float) -> IntArray:
         """Rows, ascending, of the points in the cylinder of radius `distance` [m] with flat ends about a segment."""
         cells = self.cells(self.level_of(0.0625))
-        centres = self.centres(cells)
         length = float(np.linalg.norm(end - start))
         axis = (end - start) / length
-        slack = 0.5 * np.sqrt(3.0) * cells.size
-        along, lateral = _along_lateral(centres, start, axis)
-        close = np.flatnonzero((lateral < distance + slack) & (along > -slack) & (along < length + slack))
-        if not len(close):
-            return np.zeros(0, np.int64)
-        rows = np.concatenate([np.arange(cells.starts[c], cells.starts[c + 1]) for c in close])
-        along, lateral = _along_lateral(self.points[rows], start, axis)
-        return np.asarray(rows[(lateral < distance) & (along >= 0.0) & (along <= length)])
-
-
-def _along_lateral(points: FloatArray, start: FloatArray, axis: FloatArray) -> tuple[FloatArray, FloatArray]:
-    offset = points - start
-    along = offset @ axis
-    return along, np.sqrt(np.maximum(np.einsum("ij,ij->i", offset, offset) - along**2, 0.0))
+        slack = 0.5 * float(np.sqrt(3.0)) * cells.size
+        centres = self.centres(cells)
+        return _near_segment(self.points, cells.starts, centres, slack, start, axis, length, distance)
 
 
 def build(points: FloatArray) -> Octree:
@@ -193,3 +181,42 @@ def neighbour_runs(key: int, cell_keys: IntArray, cell_starts: IntArray, level: 
                     runs[found, 1] = cell_starts[at + 1]
                     found += 1
     return found
+
+
+@njit(cache=True, nogil=True)
+def _near_segment(
+    points: FloatArray,
+    starts: IntArray,
+    centres: FloatArray,
+    slack: float,
+    start: FloatArray,
+    axis: FloatArray,
+    length: float,
+    distance: float,
+) -> IntArray:
+    """Rows of the points near a segment, looked for in cells whose points lie within `slack` [m] of their centres."""
+    close = np.empty(len(centres), np.int64)
+    cells, most = 0, 0
+    for c in range(len(centres)):
+        along, square = _along_square(centres[c], start, axis)
+        if -slack < along < length + slack and square < (distance + slack) ** 2:
+            close[cells] = c
+            cells += 1
+            most += starts[c + 1] - starts[c]
+    rows = np.empty(most, np.int64)
+    count = 0
+    for c in close[:cells]:
+        for i in range(starts[c], starts[c + 1]):
+            along, square = _along_square(points[i], start, axis)
+            if 0.0 <= along <= length and square < distance * distance:
+                rows[count] = i
+                count += 1
+    return rows[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _along_square(point: FloatArray, start: FloatArray, axis: FloatArray) -> tuple[float, float]:
+    """Position along the axis [m] and square of the distance from it."""
+    x, y, z = point[0] - start[0], point[1] - start[1], point[2] - start[2]
+    along = x * axis[0] + y * axis[1] + z * axis[2]
+    return along, x * x + y * y + z * z - along * along
