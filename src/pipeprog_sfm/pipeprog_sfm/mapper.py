@@ -39,6 +39,7 @@ RETRIEVED = 6  # views of a model that a lost keyframe is compared with, others 
 ALIKE = 3  # of these that are matched in full
 GLANCE = 400  # features that such a comparison takes
 GLANCED = MIN_INLIERS * GLANCE // COARSE  # matches of so few features that make a full comparison worth while
+LOOKOUT = 4  # keyframes from one look for a loop to the next: known ground stays in view for longer
 MAX_DRIFT = 0.05  # of the way since: what exceeds it is no drift but another place that looks alike
 RETRIES = 3  # waiting keyframes tried again with each new one
 START_CANDIDATES = 8  # waiting keyframes that a new one may start a model with
@@ -594,6 +595,8 @@ class Mapper:
         if model is None:
             return
         view = model.stamps.index(stamp)
+        if view % LOOKOUT:
+            return
         rank = np.argsort(np.argsort(model.stamps))
         old = np.abs(rank - rank[view]) > 2 * LOCAL_WINDOW
         if not old.any() or (model.covisible(view)[old] >= MIN_INLIERS).any():
