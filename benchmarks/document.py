@@ -45,6 +45,10 @@ HEADLINE = {"field": (5, 6, 7), "lab": (4,)}
 QUANTITIES = ("F", "radius RMSE [mm]", "radius RMSE of 8.6 mm [mm]", "length error [%]")
 
 NOTES = {
+    "board_views": (
+        "50 random choices of so many views for each site. The paper says that the correction for eccentricity halves "
+        "the error and that five views suffice; what is seen here:"
+    ),
     "experiment_table_1": (
         "Tables 1 to 7 come from the same surveys of generated sites through the node graph; counts are means over the "
         "sites, rates and errors are of all their pipes together. `paper's method` is Algorithm 1 over the whole "
