@@ -43,7 +43,7 @@ ADVICE = {
         "Outlines are averaged over hundreds of pixels and dozens of images, and so noise averages out.",
     ),
     "JPEG quality": (
-        "Record JPEG at a quality of 80 or more, video at the highest bit rate.",
+        "Record JPEG at a quality of 90 or more, video at the highest bit rate.",
         "Compression takes away the fine texture that ties images together before it moves an edge.",
     ),
     "distortion off, k1": (
