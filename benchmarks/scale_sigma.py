@@ -2,10 +2,10 @@
 
     .venv/bin/python -m benchmarks.scale_sigma [SEEDS]
 
-Every site is another room, another walk past the board (480p, 15 images) and another print, whose circles lie off by the
-tolerance that `sfm.board.tolerance` states. The mapper and the estimate of the scale run as in the graph, without it.
-The true scale is that of the similarity which lays the model's cameras onto the true ones: what the stated sigma is
-about. Prints a line a site and writes results/scale_sigma.json; chi2 is the mean square of error over sigma.
+Every site is another room, another walk past the board (480p, 15 images) and another print, whose circles lie off by
+the tolerance that `sfm.board.tolerance` states. The mapper and the estimate of the scale run as in the graph, without
+it. The true scale is that of the similarity which lays the model's cameras onto the true ones: what the stated sigma
+is about. Prints a line a site and writes results/scale_sigma.json; chi2 is the mean square of error over sigma.
 """
 
 from __future__ import annotations

@@ -84,6 +84,7 @@ def test_jpeg_goes_there_and_back() -> None:
     message = messages.compressed_image(17, "camera", messages.encode_jpeg(smooth))
     assert message.format == "jpeg"
     decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
     assert np.abs(decoded.astype(int) - smooth).mean() < 4.0  # grey values of 255
 
 
