@@ -88,7 +88,13 @@ def detect(
     noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)
     planes = [replace(plane, point=plane.point - shift) for plane in parse_planes(config.plane)] if config.plane else []
-    candidates = find_candidates(tree, around, noise, radius_range, planned_radii, planes, config, jury, report)
+    fresh = memory.novelty.of(points[finite])[tree.order] if memory else np.ones(len(tree.points), bool)
+    known = [_shifted(cylinder, -shift) for cylinder in memory.novelty.known] if memory else []
+    candidates = find_candidates(
+        tree, fresh, known, around, noise, radius_range, planned_radii, planes, config, jury, report
+    )
+    if memory:
+        memory.novelty.known = [_shifted(candidate.cylinder, shift) for candidate in candidates]
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
     report(0.95, "looking for thin pipes in the keyframes")
@@ -99,6 +105,8 @@ def detect(
 
 def find_candidates(
     tree: Octree,
+    fresh: NDArray[np.bool_],
+    known: Sequence[Cylinder],
     around: Surroundings,
     sigma: float,
     radius_range: tuple[float, float],
@@ -110,6 +118,7 @@ def find_candidates(
 ) -> list[Candidate]:
     """Accepted cylinders of the tree's points, none sharing points with another.
 
+    The `known` ones are measured again, and others sought among the points (N,) that are `fresh`.
     What is around them may make a corner or a hollow of them. What is too rough for the cloud alone is put to the
     images, where there are any.
     """
@@ -127,13 +136,15 @@ def find_candidates(
             cylinder = candidate.cylinder
             free[tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)] = False
 
+    for cylinder in known:
+        consider(Hypothesis(cylinder, 0))
     if config.front_end == "planes":
         report(0.2, "looking for sections of pipes")
         planes = planes or place_planes(tree, sigma, radius_range)
         for hypothesis in section_hypotheses(tree, free, planes, sigma, radius_range, config.seed, config.straighten):
             consider(hypothesis)
     else:
-        for hypothesis in _voted(tree, free, sigma, radius_range, planned_radii, report):
+        for hypothesis in _voted(tree, fresh, free, sigma, radius_range, planned_radii, report):
             consider(hypothesis)
     report(0.8, "measuring")
     # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate.
@@ -148,23 +159,26 @@ def find_candidates(
 
 def _voted(
     tree: Octree,
+    fresh: NDArray[np.bool_],
     free: NDArray[np.bool_],
     sigma: float,
     radius_range: tuple[float, float],
     planned_radii: Sequence[float],
     report: Report,
 ) -> Iterator[Hypothesis]:
-    """Hypotheses of the tree's points that are free at that time (N,): bent patches, fine to coarse, then lines."""
+    """Hypotheses of the tree's fresh points that are free at that time: bent patches, fine to coarse, then lines."""
+    if not fresh.any():
+        return
     scales = [scale for scale in _SCALES if scale < radius_range[1] and 2.0 * scale > radius_range[0]]
     for number, scale in enumerate(scales):
         report(0.2 + 0.5 * number / len(scales), f"looking for pipes in patches of {1e3 * scale:.0f} mm")
-        rest = tree.subset(free)
+        rest = tree.subset(free & fresh)
         fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
         shape = normals.surfaces(fine, rest.thinned(rest.level_of(scale)), scale, sigma)
         yield from hypotheses.consensus(hypotheses.votes_of(shape, sigma, radius_range))
     report(0.7, "looking for thin pipes")
     thin = [planned for planned in planned_radii if planned < _THICKEST_LINE] or [0.5 * _THICKEST_LINE]
-    rest = tree.subset(free)
+    rest = tree.subset(free & fresh)
     fine = rest.thinned(rest.level_of(_LINE_SCALE / _POINTS_PER_SCALE))
     shape = normals.surfaces(fine, rest.thinned(rest.level_of(0.5 * _LINE_SCALE)), _LINE_SCALE, sigma)
     for line in hypotheses.consensus(hypotheses.line_votes(shape, sigma, _THICKEST_LINE)):
@@ -228,6 +242,10 @@ def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig, roughness:
     )
 
 
+def _shifted(cylinder: Cylinder, by: FloatArray) -> Cylinder:
+    return Cylinder(cylinder.start + by, cylinder.end + by, cylinder.radius)
+
+
 def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
     """The pose for a map whose origin is moved to `shift` (3,)."""
     pose = camera_from_map.copy()
@@ -246,7 +264,7 @@ def _pipe(measured: Measured, bill: Bill, shift: FloatArray, concave: bool) -> P
     verdict = classify.classify(cylinder.radius, sigma, bill, concave)
     return Pipe(
         "",
-        Cylinder(cylinder.start + shift, cylinder.end + shift, cylinder.radius),
+        _shifted(cylinder, shift),
         sigma,
         verdict.name,
         verdict.probability,

@@ -1,4 +1,4 @@
-"""What the keyframes said about a candidate, so that they are not asked again while nothing has changed."""
+"""What is known from the last map, so that neither cloud nor keyframes are asked again while nothing has changed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_detect.contour import ContourFit
+from pipeprog_detect.novelty import Novelty
 from pipeprog_detect.outline import project
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.runs import near
@@ -34,10 +35,12 @@ class _Answer:
 class Memory:
     """Fits of the last map by candidate; for one survey, whose keyframes keep their stamps and images.
 
+    `novelty`: what the last map's cloud was like.
     `edges`: straight edges (N, 2, 2) [px] by a keyframe's stamp and the width at which they were sought.
     """
 
     def __init__(self) -> None:
+        self.novelty = Novelty()
         self.edges: dict[tuple[int, int], FloatArray] = {}
         self._last: list[_Answer] = []
         self._current: list[_Answer] = []
