@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,16 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
         "right_class": sum(score["classification"]["true_positives"] for score in scores) / true,
         "radius_rmse_mm": float(np.sqrt(np.mean(radius_errors**2))),
         "radius_worst_mm": float(np.abs(radius_errors).max()),
-        "length_mean_percent": float(np.mean([abs(pipe["length_error_percent"]) for pipe in pipes])),
+        "length_mean_percent": _length_error(pipes),
+        "wide_length_mean_percent": _length_error([pipe for pipe in pipes if pipe["true_radius"] > WIDE]),
         "scale_percent": max(abs(score["scale"]["error_percent"]) for score in scores),
         "camera_rms_mm": max(score["trajectory"]["rms_rigid_mm"] for score in scores),
         "sigma_chi_square": float(np.mean((radius_errors / (1e3 * np.array(sigmas))) ** 2)),
     }
+
+
+def _length_error(pipes: Sequence[dict[str, Any]]) -> float:
+    return float(np.mean([abs(pipe["length_error_percent"]) for pipe in pipes]))
 
 
 def _survey(recording: Recording, out: Path) -> dict[str, Any]:
