@@ -125,7 +125,7 @@ class DetectNode(Node):
             if (self._intermediate or final) and self._received.issuperset(stamps.tolist()):
                 points, normals = messages.points_from_cloud(parts[PointCloud2])
                 self._maps[status.map_revision] = status
-                self._worker.send(Map(status.map_revision, points, normals, stamps, map_from_camera))
+                self._worker.send(Map(status.map_revision, points, normals, stamps, map_from_camera, final))
                 for earlier in [other for other in self._parts if other <= stamp]:
                     del self._parts[earlier]
             return

@@ -16,6 +16,7 @@ from pipeprog_detect.detector import detect
 from pipeprog_detect.identity import Identities
 from pipeprog_detect.keyframes import Keyframes
 from pipeprog_detect.memory import Memory
+from pipeprog_detect.novelty import Novelty
 from pipeprog_detect.pipe import Cloud, Pipe
 
 
@@ -30,13 +31,17 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Map:
-    """Command: detect in this map; poses (M, 4, 4) map_from_camera belong to stamps (M,)."""
+    """Command: detect in this map; poses (M, 4, 4) map_from_camera belong to stamps (M,).
+
+    What is found in a `final` map does not depend on the maps before it.
+    """
 
     revision: int
     points: NDArray[np.float32]
     normals: NDArray[np.float32] | None
     stamps: NDArray[np.int64]
     map_from_camera: NDArray[np.float64]
+    final: bool
 
 
 @dataclass(frozen=True)
@@ -66,5 +71,7 @@ def serve(connection: Connection, config: DetectConfig, bill: Bill) -> None:
             if stamp in keyframes
         ]
         memory.next_map()
+        if newest.final:
+            memory.novelty = Novelty()
         pipes = identities.named(detect(cloud, bill, config, views, memory=memory))
         connection.send(PipesReady(newest.revision, pipes, progress(pipes, bill)))
