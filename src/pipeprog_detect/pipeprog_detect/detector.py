@@ -64,9 +64,11 @@ def detect(
     if not finite.any():
         raise InputError(f"the cloud holds no point with finite coordinates ({len(points)} in all): check its source")
     # Far from the origin (UTM) doubles still hold micrometres, squares of them do not.
-    shift = np.round(np.median(points[finite], axis=0))
+    points = points[finite]
+    shift = np.round(np.median(points, axis=0))
+    points = points - shift
     report(0.0, "sorting points")
-    tree = octree.build(points[finite] - shift)
+    tree = octree.build(points)
     report(0.1, "estimating noise")
     sigma = normals.estimate_noise(tree)
     widest = 1.5 * max(planned.outer_radius for planned in bill.classes)
@@ -82,13 +84,13 @@ def detect(
         return _product([Measured(each, each.cylinder, each.radius_sigma) for each in seen], bill, shift, config)
     planned_radii = [planned.outer_radius for planned in bill.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
-    judging = with_depths(local_views, points[finite] - shift) if config.contour.enabled else []
+    judging = with_depths(local_views, points) if config.contour.enabled else []
     jury = Jury(judging, bill, config.contour, memory)
     # A cloud with normals towards cameras is stereo's, too.
     noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)
     planes = [replace(plane, point=plane.point - shift) for plane in parse_planes(config.plane)] if config.plane else []
-    fresh = memory.novelty.of(points[finite])[tree.order] if memory else np.ones(len(tree.points), bool)
+    fresh = memory.novelty.of(points + shift)[tree.order] if memory else np.ones(len(tree.points), bool)
     known = [_shifted(cylinder, -shift) for cylinder in memory.novelty.known] if memory else []
     candidates = find_candidates(
         tree, fresh, known, around, noise, radius_range, planned_radii, planes, config, jury, report
@@ -98,7 +100,7 @@ def detect(
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
     report(0.95, "looking for thin pipes in the keyframes")
-    measured += jury.measure_lost(points[finite] - shift, _THICKEST_LINE, measured)
+    measured += jury.measure_lost(points, _THICKEST_LINE, measured)
     report(1.0, "done")
     return _product(measured, bill, shift, config)
 

@@ -13,8 +13,9 @@ from pipeprog_detect.pipe import Cylinder, FloatArray
 
 # Places are cells [m] with those next to them: an adjustment that moves the map by centimetres is no news.
 _CELL = 0.1
-# Points that a place has more than before, as a share and in all, from which on it may show what it did not.
-_MORE, _LEAST = 0.5, 30
+# By what share a place has more points than before when it may show what it did not, and by how many standard
+# deviations of two counts beyond that.
+_MORE, _CERTAIN = 0.5, 4.0
 # What surrounds news is sought again [m]: a pipe of which a part was there, and the widest patch that votes for one.
 _CONTEXT = 0.4
 _NEIGHBOURS = np.array(list(product((-1, 0, 1), repeat=3)))
@@ -42,7 +43,7 @@ class Novelty:
         before = _around(cells, self._keys, self._counts)
         now = _around(cells, keys, counts)
         self._keys, self._counts = keys, counts.astype(np.int64)
-        news = now > np.maximum((1.0 + _MORE) * before, before + _LEAST)
+        news = now - (1.0 + _MORE) * before > _CERTAIN * np.sqrt(now + (1.0 + _MORE) ** 2 * before)
         if not news.any():
             return np.zeros(len(points), bool)
         gaps = cKDTree(_CELL * cells[news]).query(_CELL * cells, distance_upper_bound=_CONTEXT)[0]
