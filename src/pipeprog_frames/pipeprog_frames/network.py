@@ -5,9 +5,10 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Iterable
 
+from pipeprog_frames.corners import corners
 from pipeprog_frames.feedback import MIN_RUN, Middle, Tie
 from pipeprog_frames.selector import DAMAGED, Decision, Load
-from pipeprog_frames.tracker import MIN_CORNERS, corners
+from pipeprog_frames.tracker import MIN_CORNERS
 
 START_PERIOD = 2_000_000_000  # ns: 0.5 frames a second
 TOLERANCE = 1e-6  # of an overlap, which travels as a float of 32 bits

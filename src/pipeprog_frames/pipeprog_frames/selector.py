@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
+from pipeprog_frames.corners import corners, sharpness
 from pipeprog_frames.decoding import GrayImage
-from pipeprog_frames.tracker import MIN_CORNERS, Track, Tracker, corners, sharpness
+from pipeprog_frames.tracker import MIN_CORNERS, Track, Tracker
 
 NAN = float("nan")
 DAMAGED = "damaged image"

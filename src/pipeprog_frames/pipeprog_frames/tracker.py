@@ -6,53 +6,40 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
+from pipeprog_frames.corners import PointArray, corners
 from pipeprog_frames.decoding import GrayImage
 
-PointArray = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-CELLS = 16  # along the image's longer side, one corner each: four times what a hull and a median need
-BLOCK = 3  # px, of the window that a corner is judged by
-LEAST_QUALITY = 0.01  # of the image's best corner
-LEAST_EIGENVALUE = 2e-5  # more than what two grey levels of noise make of a blank image at a quarter of its size
 MIN_CORNERS = 30  # below this a hull and a median say nothing
 MIN_TRACKED = 10  # an affine map takes three: the rest are witnesses
 AGREEING_MIN = 0.4  # corners that slid agree by chance on some map: a minority is no evidence
 RELIEF_MAX = 0.03  # share of the width by which near and far points may part from one affine map between keyframes
-LK_WINDOW = (9, 9)  # at the coarsest level already half of the image's height: a larger one would look past its edge
-LK_LEVELS = 4  # reaches 9/2 * 2^4 = 72 px, a quarter of the width: a turn of 16 degrees between frames
-LK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)  # finer than what a share of area asks for
+# At the coarsest level nearly half of the image's height: a larger one would look past its edge. Eight pixels are one
+# SIMD register: nine take 1.2 times as long, seven twice.
+LK_WINDOW = (8, 8)
+LK_LEVELS = 4  # reaches 8/2 * 2^4 = 64 px, a fifth of the width: a turn of 14 degrees between frames
+LK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.1)  # px; a hundredth of overlap is three
 KABSCH_ROUNDS = 3  # more move the median by less than a pixel of the full image, a fiftieth of what makes a keyframe
 
 
-def sharpness(gray: GrayImage) -> float:
-    """Variance of the Laplacian, whose mean is zero; comparable among neighbouring frames only."""
-    return cv2.norm(cv2.Laplacian(gray, cv2.CV_16S)) ** 2 / gray.size
-
-
-def corners(gray: GrayImage) -> PointArray:
-    """(N, 2) corners to track: the best of each cell (Shi and Tomasi, CVPR 1994), so they are spread over the image."""
-    quality = cv2.cornerMinEigenVal(gray, BLOCK)
-    height, width = gray.shape
-    size = max(height, width) // CELLS
-    rows, columns = height // size, width // size
-    cells = quality[: rows * size, : columns * size].reshape(rows, size, columns, size).swapaxes(1, 2)
-    cells = cells.reshape(rows * columns, size * size)
-    best = cells.argmax(axis=1)
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    found = np.stack([column * size + best % size, row * size + best // size], axis=1).astype(np.float32)
-    strength = cells[np.arange(rows * columns), best]
-    return found[strength > max(LEAST_QUALITY * float(strength.max()), LEAST_EIGENVALUE)]
-
-
-def _shared_area(affine: NDArray[np.float64], width: int, height: int) -> float:
+def _shared_area(affine: FloatArray, width: int, height: int) -> float:
     """Share of the image that the keyframe's image covers after the (2, 3) map `affine`."""
     frame = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     moved = (frame @ affine[:, :2].T + affine[:, 2]).astype(np.float32)
     return float(cv2.intersectConvexConvex(frame, moved)[0]) / (width * height)
+
+
+def _fit_affine(points: PointArray, moved: PointArray) -> FloatArray:
+    """The (2, 3) affine map that brings (N, 2) points nearest to where they moved, by least squares."""
+    design = np.ones((len(points), 3))
+    design[:, :2] = points
+    affine: FloatArray = np.linalg.solve(design.T @ design, design.T @ moved.astype(float)).T
+    return affine
 
 
 @dataclass(frozen=True)
@@ -81,14 +68,16 @@ class Tracker:
     """Follows the corners of the last keyframe from frame to frame (pyramidal Lucas-Kanade)."""
 
     def __init__(self, camera: Camera) -> None:
-        self._camera = camera
+        self._camera = self._reduced = camera
         none = np.empty((0, 2), np.float32)
         self._state = self._undo = _State(np.empty((0, 0), np.uint8), np.empty((0, 3)), none, none)
 
     def start(self, gray: GrayImage) -> int:
         """Makes (h, w) `gray` the keyframe; returns its number of corners."""
         found = corners(gray)
-        self._state = _State(gray, self._unit_rays(found, gray.shape[1]), found, found)
+        if self._reduced.width != gray.shape[1]:
+            self._reduced = self._camera.scaled(gray.shape[1] / self._camera.width)
+        self._state = _State(gray, self._unit_rays(found), found, found)
         return len(found)
 
     def track(self, gray: GrayImage) -> Track:
@@ -104,11 +93,14 @@ class Tracker:
         if held.sum() < MIN_TRACKED:
             return self._lost(gray)
         state = _State(gray, before.rays, before.reference, moved).kept(held)
-        affine, inliers = cv2.estimateAffine2D(state.reference, state.current, ransacReprojThreshold=RELIEF_MAX * width)
+        affine, inliers = cv2.estimateAffine2D(
+            state.reference, state.current, ransacReprojThreshold=RELIEF_MAX * width, refineIters=0
+        )
         if affine is None or inliers.sum() < max(MIN_TRACKED, AGREEING_MIN * len(inliers)):
             return self._lost(gray)
-        self._state = state.kept(inliers.ravel() > 0)
-        return Track(_shared_area(affine, width, height), self._parallax(), len(self._state.current))
+        self._state = state = state.kept(inliers.ravel() > 0)
+        affine = _fit_affine(state.reference, state.current)
+        return Track(_shared_area(affine, width, height), self._parallax(), len(state.current))
 
     def undo(self) -> None:
         """Forgets the last frame tracked: a covered lens or a dark second must not lose the corners."""
@@ -119,24 +111,51 @@ class Tracker:
         self._state = replace(self._state.kept(none), image=gray)
         return Track(0.0, float("nan"), 0)
 
-    def _unit_rays(self, points: PointArray, width: int) -> FloatArray:
+    def _unit_rays(self, points: PointArray) -> FloatArray:
         """(N, 3) directions of (N, 2) points of the reduced image."""
-        camera = self._camera
-        pixels = camera.undistort_points((points + 0.5) * (camera.width / width) - 0.5)
-        rays = np.ones((len(points), 3))
-        rays[:, :2] = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
+        camera = self._reduced
+        return _directions(camera.undistort_points(points), camera.fx, camera.fy, camera.cx, camera.cy)
 
     def _parallax(self) -> float:
         """Median displacement that no rotation of the camera explains [px of the full image]."""
-        reference = self._state.rays
-        current = self._unit_rays(self._state.current, self._state.image.shape[1])
-        weights = np.ones(len(reference))
-        for _ in range(KABSCH_ROUNDS):  # reweighted: near points, which move most, must not turn the far ones
-            u, _, vt = np.linalg.svd((current.T * weights) @ reference)
-            if np.linalg.det(u @ vt) < 0:
-                u[:, 2] = -u[:, 2]
-            difference = current - reference @ (u @ vt).T
-            residual = np.sqrt(np.einsum("ij,ij->i", difference, difference))
-            weights = 1.0 / np.maximum(residual, 1e-4)
-        return float(np.partition(residual, len(residual) // 2)[len(residual) // 2]) * self._camera.fx
+        return _unexplained(self._state.rays, self._unit_rays(self._state.current)) * self._camera.fx
+
+
+@njit(cache=True)
+def _directions(pixels: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
+    """(N, 3) unit rays through (N, 2) pixels of a pinhole camera."""
+    rays = np.empty((len(pixels), 3))
+    for n in range(len(pixels)):
+        x, y = (pixels[n, 0] - cx) / fx, (pixels[n, 1] - cy) / fy
+        norm = np.sqrt(x * x + y * y + 1.0)
+        rays[n, 0], rays[n, 1], rays[n, 2] = x / norm, y / norm, 1.0 / norm
+    return rays
+
+
+@njit(cache=True)
+def _unexplained(reference: FloatArray, current: FloatArray) -> float:
+    """Median distance [-] of (N, 3) unit rays from those of the keyframe, turned as suits most (Kabsch, reweighted)."""
+    residual = np.zeros(len(reference))
+    weights = np.ones(len(reference))
+    for _ in range(KABSCH_ROUNDS):  # reweighted: near points, which move most, must not turn the far ones
+        covariance = np.zeros((3, 3))
+        for n in range(len(reference)):
+            for i in range(3):
+                for j in range(3):
+                    covariance[i, j] += weights[n] * current[n, i] * reference[n, j]
+        u, _, vt = np.linalg.svd(covariance)
+        if np.linalg.det(u) * np.linalg.det(vt) < 0:
+            u[:, 2] = -u[:, 2]
+        rotation = u @ vt
+        for n in range(len(reference)):
+            square = 0.0
+            for i in range(3):
+                turned = (
+                    rotation[i, 0] * reference[n, 0]
+                    + rotation[i, 1] * reference[n, 1]
+                    + rotation[i, 2] * reference[n, 2]
+                )
+                square += (current[n, i] - turned) ** 2
+            residual[n] = np.sqrt(square)
+            weights[n] = 1.0 / max(residual[n], 1e-4)
+    return np.partition(residual, len(residual) // 2)[len(residual) // 2]
