@@ -344,9 +344,12 @@ class _Run:
                 latest[kind].header.stamp == stamp for kind in (PointCloud2, PathMsg)
             )
 
-        self._wait_until(
-            complete, DELIVERY_SECONDS, lambda: f"of the results came only {len(latest)} of {len(_LATCHED)}"
-        )
+        def missing() -> str:
+            if len(latest) < len(_LATCHED):
+                return f"of the results came only {len(latest)} of {len(_LATCHED)}"
+            return "cloud, poses and pipes are not of one map; does another graph run in this ROS domain?"
+
+        self._wait_until(complete, DELIVERY_SECONDS, missing)
         return _Survey(latest[PointCloud2], latest[PathMsg], latest[msg.PipeArray], latest[MarkerArray])
 
     def _spin(self, seconds: float = 0.1) -> None:
