@@ -53,6 +53,7 @@ METHODS = {
 TITLES = {"paper": "paper's method", "ours": "ours", "mixed": "its detection, our images"}
 BAND = 0.025  # default of frames.overlap_band
 SMALLEST = 8.6  # mm
+UNEXPLAINED = "images outside the band, without a reason"
 # What is known of the paper's figures: (layout, overlap [%]) -> quantity -> value. Precision and recall of its field
 # are as printed; they look swapped (docs/accuracy.md).
 PAPER: dict[tuple[str, float], dict[str, float]] = {
@@ -104,7 +105,7 @@ class Case:
             truth = json.loads(self.recording.beside("truth.json").read_text())
             figures["pipes"] = [pipe["radius"] for pipe in truth["pipes"]]
         else:
-            figures["network"] = network(RUNS / self.name, self.overlap)
+            figures["network"] = network(RUNS / self.name, self.overlap, self.method)
             figures["cloud"] = cloud_accuracy(self.recording, RUNS / self.name)
         self.kept.write_text(json.dumps(figures, indent=1) + "\n")
 
@@ -178,17 +179,21 @@ def main() -> None:
         board_views.main(runs)
 
 
-def network(out: Path, overlap_min: float) -> dict[str, int]:
+def network(out: Path, overlap_min: float, method: str) -> dict[str, int]:
     """What the network of images is like, from the results of a replay."""
     with (out / "frames.csv").open() as stream:
         rows = [row for row in csv.DictReader(stream) if row["chosen"] == "1" and row["registered"] == "1"]
-    overlaps = [float(row["overlap_n"]) for row in rows]
-    return {
+    below = [row for row in rows if float(row["overlap_n"]) < overlap_min]
+    above = [row for row in rows if float(row["overlap_n"]) > overlap_min + BAND]
+    known = {
         "images": len(rows),
         "tie points in images": sum(int(row["tie_points"]) for row in rows),
-        "images below the band": sum(overlap < overlap_min for overlap in overlaps),
-        "images above the band": sum(overlap > overlap_min + BAND for overlap in overlaps),
+        "images below the band": len(below),
+        "images above the band": len(above),
     }
+    if method == "paper":  # Algorithm 1 says of every image that it leaves outside the band why
+        known[UNEXPLAINED] = sum(not row["reason"].startswith("overlap") for row in below + above)
+    return known
 
 
 def _equal_counts(cases: Sequence[Case]) -> None:
@@ -278,6 +283,13 @@ def _found(radius_mm: float) -> Quantity:
     return found
 
 
+def _below_band(surveys: Sequence[Known]) -> float | None:
+    """Share of the images of all surveys together."""
+    networks = [survey["network"] for survey in surveys if "network" in survey]
+    images = sum(known["images"] for known in networks)
+    return round(100 * sum(known["images below the band"] for known in networks) / images, 1) if images else None
+
+
 def _how_many(surveys: Sequence[Known]) -> str:
     failed = sum("failed" in survey for survey in surveys)
     return f"{len(surveys)}" + (f", {failed} without a result" if failed else "")
@@ -289,7 +301,9 @@ NETWORK: dict[str, Quantity] = {
     "tie points in images": _mean("network", "tie points in images"),
     "dense points": _mean("cloud", "points"),
     "images below the band": _mean("network", "images below the band", digits=1),
+    "images below the band [%]": _below_band,
     "images above the band": _mean("network", "images above the band", digits=1),
+    UNEXPLAINED: _mean("network", UNEXPLAINED, digits=1),
 }
 CLOUD: dict[str, Quantity] = {
     "sites": _how_many,
