@@ -7,7 +7,8 @@ Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -23,113 +24,124 @@ HOLD = 1e6  # what holds a coordinate, in units of its pose's largest entry
 
 
 @dataclass(frozen=True)
-class Adjusted:
-    """Poses (C, 3, 3) and (C, 3), points (P, 3), and the cost before and after."""
+class Bundle:
+    """Views, points, and the observations of the points in the views, sorted by point.
+
+    Attributes:
+        rotation: (C, 3, 3) float64 camera_from_world.
+        translation: (C, 3) float64 camera_from_world.
+        points: (P, 3) float64 points_in_world.
+        start: (P + 1,) int64, the observations of point p are start[p]:start[p + 1].
+        view: (K,) int64 view of each observation.
+        rays: (K, 2) float64 normalised image coordinates.
+        focal: (C, 2) float64 px.
+    """
 
     rotation: FloatArray
     translation: FloatArray
     points: FloatArray
+    start: IntArray
+    view: IntArray
+    rays: FloatArray
+    focal: FloatArray
+
+    def arrays(self) -> tuple[NDArray[Any], ...]:
+        """All of them in this order, for compiled code."""
+        return self.rotation, self.translation, self.points, self.start, self.view, self.rays, self.focal
+
+    def residuals(self) -> FloatArray:
+        """(K, 2) reprojection errors, px."""
+        points = np.repeat(self.points, np.diff(self.start), axis=0)
+        inside = np.einsum("kij,kj->ki", self.rotation[self.view], points) + self.translation[self.view]
+        return (inside[:, :2] / inside[:, 2:] - self.rays) * self.focal[self.view]
+
+    def moved(self, index: IntArray, turns_and_shifts: FloatArray, moves: FloatArray) -> Bundle:
+        """With other poses, by the (F, 6) rows index[c] of views c (-1: stays), and points shifted by moves (P, 3)."""
+        moving = np.flatnonzero(index >= 0)
+        rotation, translation = self.rotation.copy(), self.translation.copy()
+        if len(moving):
+            step = turns_and_shifts[index[moving]]
+            rotation[moving] = rotation_from_vector(step[:, :3]) @ self.rotation[moving]
+            translation[moving] += step[:, 3:]
+        return replace(self, rotation=rotation, translation=translation, points=self.points + moves)
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """The bundle after an adjustment, and the cost before and after."""
+
+    bundle: Bundle
     initial_cost: float
     cost: float
     iterations: int
 
 
 def adjust(
-    rotation: FloatArray,
-    translation: FloatArray,
-    free: NDArray[np.bool_],
-    points: FloatArray,
-    start: IntArray,
-    view: IntArray,
-    rays: FloatArray,
-    focal: FloatArray,
-    *,
-    loss_scale: float,
-    max_iterations: int,
-    tolerance: float,
+    bundle: Bundle, free: NDArray[np.bool_], *, loss_scale: float, max_iterations: int, tolerance: float
 ) -> Adjusted:
     """Minimises Cauchy-robust reprojection errors over points and free views.
 
-    rotation (C, 3, 3), translation (C, 3): camera_from_world; free (C,): views that may move.
-    points (P, 3); observations sorted by point, those of point p in start[p]:start[p + 1], as view (K,) and
-    rays (K, 2), normalised image coordinates; focal (C, 2) px; loss_scale px, of the Cauchy loss. Ends
-    when an iteration gains less than `tolerance` of the cost.
+    free (C,): views that may move; loss_scale px, of the Cauchy loss. Ends when an iteration gains less than
+    `tolerance` of the cost.
     """
+    start, view = bundle.start, bundle.view
     index = np.where(free, np.cumsum(free) - 1, -1)
     count = int(free.sum())
-    pairs, pair_row, pair_column = _pairs(start, view, index, count)
-    rotation, translation, points = rotation.copy(), translation.copy(), points.copy()
-    cost = initial = _cost(rotation, translation, points, start, view, rays, focal, loss_scale)
+    pairs, row, column = _pairs(start, view, index, count)
+    cost = initial = _cost(*bundle.arrays(), loss_scale)
     damping = 1e-4
     iteration = 0
     while iteration < max_iterations:
         iteration += 1
-        u, gc, v, gp, w = _linearise(rotation, translation, points, start, view, index, rays, focal, count, loss_scale)
+        u, gc, v, gp, w = _linearise(*bundle.arrays(), index, count, loss_scale)
         gained = 0.0
         for _ in range(6):
-            blocks, gradient, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(pair_row), damping)
-            step = _solve(blocks, pair_row, pair_column, gradient)
-            moves = _back_substitute(step.reshape(-1, 6), gp, w, v_inverse, start, view, index)
-            new_rotation, new_translation = _move(rotation, translation, index, step.reshape(-1, 6))
-            new_points = points + moves
-            new_cost = _cost(new_rotation, new_translation, new_points, start, view, rays, focal, loss_scale)
+            blocks, gradient, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(row), damping)
+            step = _solve(blocks, row, column, gradient).reshape(-1, 6)
+            moves = _back_substitute(step, gp, w, v_inverse, start, view, index)
+            candidate = bundle.moved(index, step, moves)
+            new_cost = _cost(*candidate.arrays(), loss_scale)
             if new_cost < cost:
                 gained = cost - new_cost
-                rotation, translation, points, cost = new_rotation, new_translation, new_points, new_cost
+                bundle, cost = candidate, new_cost
                 damping = max(damping * 0.1, 1e-9)
                 break
             damping *= 10
         if gained <= tolerance * cost:
             break
-    return Adjusted(rotation, translation, points, initial, cost, iteration)
+    return Adjusted(bundle, initial, cost, iteration)
 
 
-def function_covariance(
-    gradients: FloatArray,
-    rotation: FloatArray,
-    translation: FloatArray,
-    points: FloatArray,
-    start: IntArray,
-    view: IntArray,
-    rays: FloatArray,
-    focal: FloatArray,
-    *,
-    loss_scale: float,
-) -> FloatArray:
+def function_covariance(gradients: FloatArray, bundle: Bundle, *, loss_scale: float) -> FloatArray:
     """(S, S) covariance of S functions of all adjusted poses which no similarity of the whole model changes.
 
-    gradients (S, C, 6): derivatives by each pose, turned from the left by a vector and shifted; the rest as in
-    `adjust`, at its minimum. This is the covariance of an M-estimator that trusts nothing but the independence of the
+    gradients (S, C, 6): derivatives by each pose, turned from the left by a vector and shifted; bundle: at the minimum
+    that `adjust` finds. This is the covariance of an M-estimator that trusts nothing but the independence of the
     points (Huber 1967; White 1982; Liang and Zeger 1986, with points as clusters): whatever the localisation of a
     feature has in common over the views of its point, and whatever the residuals show beyond noise, is counted.
     """
-    count = len(rotation)
-    centres = -np.einsum("cji,cj->ci", rotation, translation)
+    start, view, count = bundle.start, bundle.view, len(bundle.rotation)
+    centres = -np.einsum("cji,cj->ci", bundle.rotation, bundle.translation)
     index = np.append(np.arange(count - 1), -1)  # the last pose holds the model's place
     pairs, row, column = _pairs(start, view, index, count - 1)
-    u, gc, v, gp, w = _linearise(rotation, translation, points, start, view, index, rays, focal, count - 1, loss_scale)
+    u, gc, v, gp, w = _linearise(*bundle.arrays(), index, count - 1, loss_scale)
     blocks, _, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(row), 0.0)
     # One coordinate of the pose farthest from it holds the size.
     far = int(np.linalg.norm(centres - centres[-1], axis=1).argmax())
-    axis = 3 + int(np.abs(rotation[far] @ (centres[far] - centres[-1])).argmax())
+    axis = 3 + int(np.abs(bundle.rotation[far] @ (centres[far] - centres[-1])).argmax())
     blocks[pairs[far, far], axis, axis] += HOLD * np.abs(blocks[pairs[far, far]]).max()
 
-    error = _residuals(rotation, translation, points, start, view, rays, focal)
+    error = bundle.residuals()
     square = (error**2).sum(axis=1)
     weight = 1.0 / (1.0 + square / loss_scale**2)
-    scores = np.zeros((len(gradients), len(points)))
+    scores = np.zeros((len(gradients), len(bundle.points)))
     for number, gradient in enumerate(gradients):
         if not gradient.any():
             continue
         poses = _solve(blocks, row, column, gradient[:-1]).reshape(-1, 6)
         moves = _back_substitute(poses, np.zeros_like(gp), w, v_inverse, start, view, index)
-        size = DIFFERENCE / max(float(np.abs(poses).max() * focal.max()), 1e-300)
-        ends = [
-            _residuals(
-                *_move(rotation, translation, index, step * poses), points + step * moves, start, view, rays, focal
-            )
-            for step in (size, -size)
-        ]
+        size = DIFFERENCE / max(float(np.abs(poses).max() * bundle.focal.max()), 1e-300)
+        ends = [bundle.moved(index, step * poses, step * moves).residuals() for step in (size, -size)]
         derivative = (ends[0] - ends[1]) / (2 * size)
         score = np.add.reduceat(weight * (error * derivative).sum(axis=1), start[:-1])
         share = np.add.reduceat(weight * (derivative**2).sum(axis=1), start[:-1])
@@ -137,22 +149,18 @@ def function_covariance(
         scores[number] = score / (1.0 - share / share.sum())
     # A robust loss curves less than its weights say, and the poses absorb some of the residuals.
     curvature = float((weight - square * weight**2 / loss_scale**2).mean() / weight.mean())
-    freedom = 2 * len(view) - 3 * len(points)
+    freedom = 2 * len(view) - 3 * len(bundle.points)
     return scores @ scores.T / curvature**2 * freedom / max(freedom - 6 * count + 7, 1)
 
 
-def _residuals(
-    rotation: FloatArray,
-    translation: FloatArray,
-    points: FloatArray,
-    start: IntArray,
-    view: IntArray,
-    rays: FloatArray,
-    focal: FloatArray,
-) -> FloatArray:
-    """(K, 2) reprojection errors, px."""
-    inside = np.einsum("kij,kj->ki", rotation[view], np.repeat(points, np.diff(start), axis=0)) + translation[view]
-    return (inside[:, :2] / inside[:, 2:] - rays) * focal[view]
+def rotation_from_vector(vectors: FloatArray) -> FloatArray:
+    """(N, 3) rotation vectors in radians -> (N, 3, 3) matrices (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    half = np.sinc(angle / (2 * np.pi))
+    return np.eye(3) + np.sinc(angle / np.pi) * skew + 0.5 * half * half * (skew @ skew)
 
 
 def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatArray) -> FloatArray:
@@ -175,27 +183,6 @@ def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatA
         sparse, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
     return solver.solve(gradient.ravel())
-
-
-def _move(
-    rotation: FloatArray, translation: FloatArray, index: IntArray, step: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    moved = np.flatnonzero(index >= 0)
-    new_rotation, new_translation = rotation.copy(), translation.copy()
-    if len(moved):
-        new_rotation[moved] = rotation_from_vector(step[index[moved], :3]) @ rotation[moved]
-        new_translation[moved] += step[index[moved], 3:]
-    return new_rotation, new_translation
-
-
-def rotation_from_vector(vectors: FloatArray) -> FloatArray:
-    """(N, 3) rotation vectors in radians -> (N, 3, 3) matrices (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    half = np.sinc(angle / (2 * np.pi))
-    return np.eye(3) + np.sinc(angle / np.pi) * skew + 0.5 * half * half * (skew @ skew)
 
 
 @njit(cache=True, nogil=True)
@@ -249,7 +236,7 @@ def _cost(rotation, translation, points, start, view, rays, focal, loss_scale): 
 
 
 @njit(cache=True, nogil=True)
-def _linearise(rotation, translation, points, start, view, index, rays, focal, count, loss_scale):  # type: ignore[no-untyped-def]  # compiled
+def _linearise(rotation, translation, points, start, view, rays, focal, index, count, loss_scale):  # type: ignore[no-untyped-def]  # compiled
     """Blocks of the weighted normal equations; gradients are those of the descent direction."""
     u = np.zeros((count, 6, 6))
     gc = np.zeros((count, 6))

@@ -1,4 +1,4 @@
-"""A loop closed: the drift that shows where the camera is back is spread over the way that it came from."""
+"""A loop closed: where the camera is back, the drift that shows there is spread over the way that it came from."""
 
 from __future__ import annotations
 
@@ -9,9 +9,33 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, logm
 
 from pipeprog_sfm.model import SparseModel
+from pipeprog_sfm.registration import LOCAL_WINDOW, MIN_INLIERS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+MAX_DRIFT = 0.05  # of the way since: what exceeds it is no drift but another place that looks alike
+
+
+def untied(model: SparseModel, view: int) -> IntArray:
+    """Views of long ago, by their numbers; none where the view shares points with them: it is where it seems to be."""
+    rank = np.argsort(np.argsort(model.stamps))
+    old = np.abs(rank - rank[view]) > 2 * LOCAL_WINDOW
+    tied = (model.covisible(view)[old] >= MIN_INLIERS).any()
+    return np.flatnonzero(old & (not tied))
+
+
+def is_drift(model: SparseModel, view: int, other: int, scale: float, correction: FloatArray) -> bool:
+    """Whether a correction of a view is as small as drift is on the way between two views.
+
+    correction (4, 4) is rigid, applied after the scale.
+    """
+    rank, order = np.argsort(np.argsort(model.stamps)), np.argsort(model.stamps)
+    between = order[min(rank[view], rank[other]) : max(rank[view], rank[other]) + 1]
+    way = np.linalg.norm(np.diff(model.centres()[between], axis=0), axis=1).sum()
+    centre = model.centre(view)
+    drift = np.linalg.norm(correction[:3, :3] @ centre * scale + correction[:3, 3] - centre)
+    return bool(drift <= MAX_DRIFT * way)
 
 
 def shares(model: SparseModel, kept: IntArray, corrected: int) -> FloatArray:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_sfm.adjustment import adjust, function_covariance
+from pipeprog_sfm.adjustment import Bundle, adjust, function_covariance
+from pipeprog_sfm.tracks import NONE, digests, extend, filter_tracks, triangulate
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -22,7 +22,6 @@ NOISE_RANGE = (0.1, 1.0)  # px, of a coordinate: what image noise and SIFT's loc
 CAUCHY = 2.385  # scale of the loss in standard deviations for 95 % efficiency under normal noise (Holland, Welsch 1977)
 RAYLEIGH_MEDIAN = 1.1774  # of an error's length, in standard deviations of a coordinate
 MIN_ANGLE = np.radians(1.5)  # between the rays of a point: depth is known to a few per cent at 0.5 px
-NONE = -1
 
 
 class SparseModel:
@@ -67,11 +66,27 @@ class SparseModel:
         """The view's features in the flat arrays."""
         return slice(self.offsets[view], self.offsets[view + 1])
 
+    def seen(self, view: int) -> IntArray:
+        """(K,) points that the view sees, in the order of its features."""
+        own = self.point_of[self.features(view)]
+        return own[own >= 0]
+
+    def seen_by_any(self) -> IntArray:
+        """(P,) points that a view sees, ascending."""
+        return np.unique(self.point_of[self.point_of >= 0])
+
     def pose(self, view: int) -> FloatArray:
         """camera_from_model (4, 4)."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = self.rotation[view], self.translation[view]
         return pose
+
+    def poses(self) -> dict[int, FloatArray]:
+        """camera_from_model (4, 4) by stamp, in order of time."""
+        poses = np.tile(np.eye(4), (len(self), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = self.rotation, self.translation
+        order = np.argsort(self.stamps, kind="stable")
+        return dict(zip(np.array(self.stamps)[order].tolist(), poses[order], strict=True))
 
     def centres(self) -> FloatArray:
         """(V, 3) projection centres."""
@@ -105,14 +120,14 @@ class SparseModel:
         matches without a point are triangulated. `features` must be sorted.
         """
         alias = np.arange(len(self.points))
-        _continue(
+        extend(
             features, others, self.point_of, self.view_of, self.rays, self.points, alias,
             self.rotation, self.translation, self.focal, MAX_ERROR,
         )  # fmt: skip
         has = self.point_of >= 0
         self.point_of[has] = alias[self.point_of[has]]
         new = (self.point_of[features] < 0) & (self.point_of[others] < 0)
-        created = _create(
+        created = triangulate(
             features[new], others[new], self.point_of, self.view_of, self.rays, len(self.points),
             self.rotation, self.translation, self.focal, MAX_ERROR, np.cos(MIN_ANGLE),
         )  # fmt: skip
@@ -170,13 +185,12 @@ class SparseModel:
 
     def digests(self) -> NDArray[np.uint64]:
         """(V,) hash of each view's points: another number when they have changed."""
-        return _digests(self.point_of, np.array(self.offsets))
+        return digests(self.point_of, np.array(self.offsets))
 
     def covisible(self, view: int) -> IntArray:
         """(V,) number of points that each view shares with this one."""
-        mine = self.point_of[self.features(view)]
         flags = np.zeros(len(self.points) + 1, bool)
-        flags[mine[mine >= 0]] = True
+        flags[self.seen(view)] = True
         shared = np.bincount(self.view_of[flags[self.point_of]], minlength=len(self))
         shared[view] = 0
         return shared
@@ -190,20 +204,22 @@ class SparseModel:
         else:
             free[views] = True
             free[0] = False
-            seen = np.concatenate([self.point_of[self.features(view)] for view in views])
             chosen[:] = False
-            chosen[seen[seen >= 0]] = True
+            chosen[np.concatenate([self.seen(view) for view in views])] = True
         ids, start, features = self.observations(chosen)
         if not len(ids):
             return
         used, view = np.unique(self.view_of[features], return_inverse=True)
-        result = adjust(
-            self.rotation[used], self.translation[used], free[used], self.points[ids], start, view.astype(np.int64),
-            self.rays[features], self.focal[used], loss_scale=CAUCHY * self.noise,
-            max_iterations=max_iterations, tolerance=tolerance,
+        bundle = Bundle(
+            self.rotation[used], self.translation[used], self.points[ids],
+            start, view.astype(np.int64), self.rays[features], self.focal[used],
         )  # fmt: skip
-        self.rotation[used], self.translation[used] = result.rotation, result.translation
-        self.points[ids] = result.points
+        loss_scale = CAUCHY * self.noise
+        adjusted = adjust(
+            bundle, free[used], loss_scale=loss_scale, max_iterations=max_iterations, tolerance=tolerance
+        ).bundle
+        self.rotation[used], self.translation[used] = adjusted.rotation, adjusted.translation
+        self.points[ids] = adjusted.points
         if views is None:
             error = float(np.median(self.errors(features))) / RAYLEIGH_MEDIAN
             self.noise = min(max(error, NOISE_RANGE[0]), NOISE_RANGE[1])
@@ -223,14 +239,12 @@ class SparseModel:
         """(S, S) covariance of functions of the poses whose derivatives are (S, V, 6): see `function_covariance`."""
         ids, start, features = self.observations(np.ones(len(self.points), bool))
         view = self.view_of[features].astype(np.int64)
-        return function_covariance(
-            gradients, self.rotation, self.translation, self.points[ids], start, view,
-            self.rays[features], self.focal, loss_scale=CAUCHY * self.noise,
-        )  # fmt: skip
+        bundle = Bundle(self.rotation, self.translation, self.points[ids], start, view, self.rays[features], self.focal)
+        return function_covariance(gradients, bundle, loss_scale=CAUCHY * self.noise)
 
     def filter(self, ids: IntArray, start: IntArray, features: IntArray) -> None:
         """Drops observations with a large error or behind the camera, second ones of a view, and thin points."""
-        _filter(
+        filter_tracks(
             ids, start, features, self.point_of, self.view_of, self.rays, self.points,
             self.rotation, self.translation, self.focal, MAX_ERROR, np.cos(MIN_ANGLE),
         )  # fmt: skip
@@ -248,217 +262,3 @@ def _grown(array: NDArray[Any], capacity: int) -> NDArray[Any]:
     grown = np.empty((capacity, *array.shape[1:]), array.dtype)
     grown[: len(array)] = array
     return grown
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _error(rotation, translation, focal, x, y, z, u, v):  # type: ignore[no-untyped-def]  # compiled
-    """Reprojection error in px, infinite behind the camera."""
-    depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
-    if depth <= 1e-9:
-        return np.inf
-    du = (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]) / depth - u
-    dv = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]) / depth - v
-    return np.sqrt((focal[0] * du) ** 2 + (focal[1] * dv) ** 2)
-
-
-@njit(cache=True, nogil=True)
-def _digests(point_of, offsets):  # type: ignore[no-untyped-def]  # compiled
-    """FNV-1a over the points of each view, a word at a time."""
-    digests = np.full(len(offsets) - 1, 0xCBF29CE484222325, np.uint64)
-    for view in range(len(digests)):
-        for feature in range(offsets[view], offsets[view + 1]):
-            digests[view] = (digests[view] ^ np.uint64(point_of[feature] + 1)) * np.uint64(0x100000001B3)
-    return digests
-
-
-@njit(cache=True, nogil=True)
-def _root(alias, point):  # type: ignore[no-untyped-def]  # compiled
-    while alias[point] != point:
-        point = alias[point]
-    return point
-
-
-@njit(cache=True, nogil=True)
-def _continue(  # type: ignore[no-untyped-def]  # compiled
-    features, others, point_of, view_of, rays, points, alias, rotation, translation, focal, max_error
-):
-    """Extends tracks along matches, and notes in `alias` which points are one."""
-    for m in range(len(features)):
-        a, b = features[m], others[m]
-        p, q = point_of[a], point_of[b]
-        if p < 0 and q < 0:
-            continue
-        if p >= 0:
-            p = _root(alias, p)
-        if q >= 0:
-            q = _root(alias, q)
-        if p == q:
-            continue
-        if p < 0 or q < 0:
-            source, feature = (q, a) if p < 0 else (p, b)
-            view = view_of[feature]
-            error = _error(
-                rotation[view], translation[view], focal[view],
-                points[source, 0], points[source, 1], points[source, 2], rays[feature, 0], rays[feature, 1],
-            )  # fmt: skip
-            if error < max_error:
-                point_of[feature] = source
-            continue
-        agree = True
-        for feature in (a, b):
-            for point in (p, q):
-                view = view_of[feature]
-                error = _error(
-                    rotation[view], translation[view], focal[view],
-                    points[point, 0], points[point, 1], points[point, 2], rays[feature, 0], rays[feature, 1],
-                )  # fmt: skip
-                agree = agree and error < max_error
-        if agree:
-            alias[max(p, q)] = min(p, q)
-    for p in range(len(alias)):
-        alias[p] = _root(alias, p)
-
-
-@njit(cache=True, nogil=True)
-def _create(  # type: ignore[no-untyped-def]  # compiled
-    features, others, point_of, view_of, rays, next_point, rotation, translation, focal, max_error, max_cosine
-):
-    """Triangulates each feature with all its matches; keeps the matches that agree."""
-    created = np.empty((len(features), 3))
-    count = 0
-    begin = 0
-    while begin < len(features):
-        end = begin
-        while end < len(features) and features[end] == features[begin]:
-            end += 1
-        size = end - begin + 1
-        track = np.empty(size, np.int64)
-        track[0] = features[begin]
-        track[1:] = others[begin:end]
-        begin = end
-        directions = np.empty((size, 3))
-        centres = np.empty((size, 3))
-        for k in range(size):
-            view = view_of[track[k]]
-            u, v = rays[track[k], 0], rays[track[k], 1]
-            norm = np.sqrt(u * u + v * v + 1)
-            for i in range(3):
-                r = rotation[view]
-                directions[k, i] = (r[0, i] * u + r[1, i] * v + r[2, i]) / norm
-                centres[k, i] = -(
-                    r[0, i] * translation[view, 0] + r[1, i] * translation[view, 1] + r[2, i] * translation[view, 2]
-                )
-        # The widest pair fixes the point; all that agree with it refine it.
-        widest, first, second = 2.0, -1, -1
-        for k in range(size):
-            for m in range(k + 1, size):
-                cosine = (
-                    directions[k, 0] * directions[m, 0]
-                    + directions[k, 1] * directions[m, 1]
-                    + directions[k, 2] * directions[m, 2]
-                )
-                if cosine < widest:
-                    widest, first, second = cosine, k, m
-        if widest > max_cosine:
-            continue
-        chosen = np.zeros(size, np.bool_)
-        chosen[first] = chosen[second] = True
-        point = np.zeros(3)
-        agreeing = 0
-        for _ in range(2):
-            normal = np.zeros((3, 3))
-            right = np.zeros(3)
-            for k in range(size):
-                if not chosen[k]:
-                    continue
-                for i in range(3):
-                    for j in range(3):
-                        projector = (1.0 if i == j else 0.0) - directions[k, i] * directions[k, j]
-                        normal[i, j] += projector
-                        right[i] += projector * centres[k, j]
-            point[:] = np.linalg.solve(normal, right)
-            agreeing = 0
-            for k in range(size):
-                view = view_of[track[k]]
-                chosen[k] = (
-                    _error(
-                        rotation[view], translation[view], focal[view],
-                        point[0], point[1], point[2], rays[track[k], 0], rays[track[k], 1],
-                    )
-                    < max_error
-                )  # fmt: skip
-                agreeing += chosen[k]
-            if agreeing < 2:
-                break
-        if agreeing < 2 or not chosen[0]:
-            continue
-        free = 0
-        narrow = 2.0
-        for k in range(size):
-            if chosen[k] and point_of[track[k]] < 0:
-                free += 1
-                for m in range(k):
-                    if chosen[m] and point_of[track[m]] < 0:
-                        narrow = min(
-                            narrow,
-                            directions[k, 0] * directions[m, 0]
-                            + directions[k, 1] * directions[m, 1]
-                            + directions[k, 2] * directions[m, 2],
-                        )
-        if free < 2 or narrow > max_cosine:
-            continue
-        for k in range(size):
-            if chosen[k] and point_of[track[k]] < 0:
-                point_of[track[k]] = next_point + count
-        created[count] = point
-        count += 1
-    return created[:count].copy()
-
-
-@njit(cache=True, nogil=True)
-def _filter(  # type: ignore[no-untyped-def]  # compiled
-    ids, start, features, point_of, view_of, rays, points, rotation, translation, focal, max_error, max_cosine
-):
-    for n in range(len(ids)):
-        p = ids[n]
-        x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        size = start[n + 1] - start[n]
-        error = np.empty(size)
-        for k in range(size):
-            feature = features[start[n] + k]
-            view = view_of[feature]
-            error[k] = _error(
-                rotation[view], translation[view], focal[view], x, y, z, rays[feature, 0], rays[feature, 1]
-            )
-        direction = np.empty((size, 3))
-        kept = 0
-        widest = 2.0
-        for k in range(size):
-            feature = features[start[n] + k]
-            view = view_of[feature]
-            good = error[k] < max_error
-            for m in range(size):
-                if good and m != k and view_of[features[start[n] + m]] == view:
-                    good = error[k] < error[m] or (error[k] == error[m] and k < m)
-            if not good:
-                point_of[feature] = NONE
-                continue
-            r = rotation[view]
-            for i in range(3):
-                direction[kept, i] = points[p, i] + (
-                    r[0, i] * translation[view, 0] + r[1, i] * translation[view, 1] + r[2, i] * translation[view, 2]
-                )
-            norm = np.sqrt(direction[kept, 0] ** 2 + direction[kept, 1] ** 2 + direction[kept, 2] ** 2)
-            for i in range(3):
-                direction[kept, i] /= norm
-            for m in range(kept):
-                widest = min(
-                    widest,
-                    direction[kept, 0] * direction[m, 0]
-                    + direction[kept, 1] * direction[m, 1]
-                    + direction[kept, 2] * direction[m, 2],
-                )
-            kept += 1
-        if kept < 2 or widest > max_cosine:
-            for k in range(size):
-                point_of[features[start[n] + k]] = NONE

@@ -20,8 +20,9 @@ from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense import DenseMapper, EncodedImage, centre
 from pipeprog_sfm.fusion import FusedCloud
-from pipeprog_sfm.mapper import GROWTH, FrameTie, KeyframeReport, Mapper
+from pipeprog_sfm.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.motion import Motion
+from pipeprog_sfm.overlap import FrameTie
 from pipeprog_sfm.scale import NoScaleError, ScaleEstimate
 from pipeprog_sfm.target_file import Targets
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.mapper import FrameTie
 from pipeprog_sfm.motion import Motion
+from pipeprog_sfm.overlap import FrameTie
 from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
 from pipeprog_sfm.target_file import Targets
 from pipeprog_sfm.warm_up import warm_up

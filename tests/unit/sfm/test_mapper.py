@@ -2,74 +2,22 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scenes import CAMERA, STEP, blurred, centre, pose, position_errors, ring_pose, ring_view, view
 
 import pipeprog_sfm.mapper as mapper_module
+import pipeprog_sfm.retrieval as retrieval_module
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features import Features, root_sift
 from pipeprog_sfm.mapper import Mapper
 from pipeprog_sfm.matching import match
 
-CAMERA = Camera(1280, 720, 900.0, 900.0, 639.5, 359.5)
-NOISE = 0.3  # px
-STEP = 200_000_000  # ns
 POSITION_TOLERANCE = 0.003  # m at 2 m from the wall: some ten times the noise of a camera held by 300 points
-
-
-def corner(length: float = 6.0) -> NDArray[np.float64]:
-    """Points of a wall (z = 2), a side wall and a floor; x along the walk, y down, metres."""
-    rng = np.random.default_rng(7)
-    count = int(700 * length)
-    wall = np.c_[rng.uniform(-2, length, count), rng.uniform(-1.2, 1.2, count), np.full(count, 2.0)]
-    floor = np.c_[rng.uniform(-2, length, count), np.full(count, 1.2), rng.uniform(0.8, 2.0, count)]
-    boxes = np.c_[rng.uniform(-2, length, count), rng.uniform(-1, 1, count), rng.uniform(1.6, 2.0, count)]
-    return np.concatenate([wall, floor, boxes])
-
-
-@lru_cache
-def world(period: float | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points and their descriptors; with a period the wall's texture repeats along x."""
-    rng = np.random.default_rng(3)
-    points = corner()
-    looks = rng.gamma(0.7, 1.0, (len(points), 128))
-    if period is not None:
-        third = len(points) // 3
-        tile = points[:third][(points[:third, 0] >= 0) & (points[:third, 0] < period)]
-        copies = [tile + np.array([n * period, 0, 0]) for n in range(-1, int(6 / period))]
-        points = np.concatenate([*copies, points[third:]])
-        looks = np.concatenate([*[looks[: len(tile)]] * len(copies), looks[third:]])
-    return points, looks
-
-
-def pose(x: float, yaw: float = 0.0) -> NDArray[np.float64]:
-    """camera_from_world of a camera at (x, 0, 0) that looks along z, turned by yaw."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    matrix = np.eye(4)
-    matrix[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    matrix[:3, 3] = -matrix[:3, :3] @ [x, 0.05 * np.sin(3 * x), 0.1 * np.cos(2 * x)]
-    return matrix
-
-
-def view(camera_from_world: NDArray[np.float64], seed: int, period: float | None = None) -> Features:
-    rng = np.random.default_rng(seed)
-    points, looks = world(period)
-    inside = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    pixels = inside[:, :2] / inside[:, 2:] * 900.0 + [639.5, 359.5]
-    seen = (inside[:, 2] > 0.2) & (pixels > 0).all(axis=1) & (pixels < [1280, 720]).all(axis=1)
-    seen &= rng.random(len(points)) < 0.7
-    index = rng.permutation(np.flatnonzero(seen))
-    clutter = 100
-    keypoints = pixels[index] + rng.normal(0, NOISE, (len(index), 2))
-    keypoints = np.concatenate([keypoints, rng.uniform([0, 0], [1280, 720], (clutter, 2))])
-    descriptors = looks[index] * rng.lognormal(0, 0.15, (len(index), 128))
-    descriptors = np.concatenate([descriptors, rng.gamma(0.7, 1.0, (clutter, 128))])
-    return Features(keypoints.astype(np.float32), root_sift(descriptors.astype(np.float32)))
 
 
 def walk(xs: NDArray[Any], period: float | None = None, seed: int = 0) -> tuple[Mapper, dict[int, NDArray[Any]]]:
@@ -80,21 +28,6 @@ def walk(xs: NDArray[Any], period: float | None = None, seed: int = 0) -> tuple[
         mapper.add_features(n * STEP, view(truth[n * STEP], n, period), CAMERA)
     mapper.finish()
     return mapper, truth
-
-
-def centre(camera_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-
-
-def position_errors(found: dict[int, NDArray[Any]], truth: dict[int, NDArray[Any]]) -> NDArray[np.float64]:
-    """Distances from the true positions in metres after the best similarity (Umeyama, PAMI 1991)."""
-    a = np.array([centre(found[stamp]) for stamp in found])
-    b = np.array([centre(truth[stamp]) for stamp in found])
-    da, db = a - a.mean(axis=0), b - b.mean(axis=0)
-    u, s, vt = np.linalg.svd(db.T @ da)
-    sign = np.diag([1, 1, np.linalg.det(u @ vt)])
-    rotation, scale = u @ sign @ vt, (s * np.diag(sign)).sum() / (da**2).sum()
-    return np.linalg.norm(scale * da @ rotation.T - db, axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -150,31 +83,6 @@ def test_two_models_are_joined_when_the_camera_returns() -> None:
     poses = mapper.camera_from_model()
     assert len(poses) == len(truth)
     assert position_errors(poses, truth).max() < 2 * POSITION_TOLERANCE
-
-
-def ring_view(angle: float, seed: int) -> Features:
-    """What a camera sees that walks round a column at 2 m, looking outwards at a round wall 4 m from the axis."""
-    rng = np.random.default_rng(11)
-    around = rng.uniform(0, 2 * np.pi, 9000)
-    radius, height = rng.uniform(3.4, 4.0, 9000), rng.uniform(-1.2, 1.2, 9000)
-    points = np.c_[radius * np.sin(around), height, radius * np.cos(around)]
-    looks = rng.gamma(0.7, 1.0, (len(points), 128))
-    inside = points @ ring_pose(angle)[:3, :3].T + ring_pose(angle)[:3, 3]
-    pixels = inside[:, :2] / inside[:, 2:] * 900.0 + [639.5, 359.5]
-    own = np.random.default_rng(seed)
-    seen = (inside[:, 2] > 0.2) & (pixels > 0).all(axis=1) & (pixels < [1280, 720]).all(axis=1)
-    index = own.permutation(np.flatnonzero(seen & (own.random(len(points)) < 0.7)))
-    keypoints = pixels[index] + own.normal(0, NOISE, (len(index), 2))
-    descriptors = looks[index] * own.lognormal(0, 0.15, (len(index), 128))
-    return Features(keypoints.astype(np.float32), root_sift(descriptors.astype(np.float32)))
-
-
-def ring_pose(angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    matrix = np.eye(4)
-    matrix[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-    matrix[:3, 3] = -matrix[:3, :3] @ [2 * s, 0.05 * np.sin(5 * angle), 2 * c]
-    return matrix
 
 
 def test_a_loop_is_closed_though_the_map_has_drifted() -> None:
@@ -272,7 +180,7 @@ def test_a_keyframe_that_comes_again_is_neither_searched_nor_matched_anew(monkey
         return match(a, b)
 
     monkeypatch.setattr(mapper_module, "extract", counted_extract)
-    monkeypatch.setattr(mapper_module, "match", counted_match)
+    monkeypatch.setattr(retrieval_module, "match", counted_match)
     mapper = Mapper(MapperConfig())
     for n in range(6):
         mapper.add(n * STEP, np.full((2, 2), n, np.uint8), CAMERA)
@@ -297,14 +205,6 @@ def test_what_is_remembered_of_retired_keyframes_is_bounded(monkeypatch: pytest.
         mapper.add(n * STEP, np.zeros((2, 2), np.uint8), CAMERA)
     with pytest.raises(pytest.fail.Exception, match="searched again"):
         mapper.add(2 * STEP, np.zeros((2, 2), np.uint8), CAMERA)
-
-
-def blurred(features: Features, kept: int) -> Features:
-    """What is left of features: the first `kept`, the others somewhere else."""
-    rng = np.random.default_rng(0)
-    keypoints = features.keypoints.copy()
-    keypoints[kept:] = rng.uniform([0, 0], [1280, 720], (len(keypoints) - kept, 2))
-    return Features(keypoints, features.descriptors)
 
 
 @pytest.mark.parametrize("kept", [0, 600])

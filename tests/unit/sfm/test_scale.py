@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from targets import BOARD, CAMERA, LOPSIDED, Walk, camera_from_board, exact_ellipses, render
 
-from pipeprog_sfm.adjustment import adjust, function_covariance
+from pipeprog_sfm.adjustment import Bundle, adjust, function_covariance
 from pipeprog_sfm.board import Board, identify
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import BoardConfig
@@ -23,17 +22,6 @@ CONFIG = BoardConfig()
 def told(walk, boards=(BOARD,), config=CONFIG, distances=()):
     seen = {stamp: identify(ellipses, boards, CAMERA) for stamp, ellipses in walk.ellipses.items()}
     return estimate_scale(Evidence(Targets(boards, distances), seen, walk.ellipses), walk.poses, CAMERA, config)
-
-
-@settings(max_examples=10, deadline=None)
-@given(st.integers(0, 2**16))
-def test_similarity_is_found_from_its_points(seed):
-    rng = np.random.default_rng(seed)
-    true = np.eye(4)
-    true[:3, :3] = rng.uniform(0.1, 10) * Rotation.random(random_state=seed).as_matrix()
-    true[:3, 3] = rng.normal(0, 5, 3)
-    points = np.c_[rng.normal(0, 1, (6, 2)), np.zeros(6)]
-    assert similarity(points, points @ true[:3, :3].T + true[:3, 3]) == pytest.approx(true, abs=1e-8)
 
 
 @settings(max_examples=8, deadline=None)
@@ -278,23 +266,24 @@ class DriftingWalk:
         seen[seen.sum(1) < 2] = False
         wall, pixels, seen = wall[seen.any(1)], pixels[seen.any(1)], seen[seen.any(1)]
         views_of_points = np.nonzero(seen)[1]
-        arrays = {
-            "start": np.append(0, np.cumsum(seen.sum(1))),
-            "view": views_of_points,
-            "rays": pixels[seen] / [CAMERA.fx, CAMERA.fy],
-            "focal": np.full((views, 2), CAMERA.fx),
-            "loss_scale": 2.385 * 0.3,
-        }
+        truth = Bundle(
+            rotation=true[:, :3, :3],
+            translation=true[:, :3, 3],
+            points=wall,
+            start=np.append(0, np.cumsum(seen.sum(1))),
+            view=views_of_points,
+            rays=pixels[seen] / [CAMERA.fx, CAMERA.fy],
+            focal=np.full((views, 2), CAMERA.fx),
+        )
         free = np.ones(views, bool)
         free[0] = False
-        result = adjust(true[:, :3, :3], true[:, :3, 3], free, wall, **arrays, max_iterations=30, tolerance=1e-10)
+        loss_scale = 2.385 * 0.3
+        result = adjust(truth, free, loss_scale=loss_scale, max_iterations=30, tolerance=1e-10).bundle
         self.poses = {}
         for stamp in range(views):
             self.poses[stamp] = true[stamp].copy()
             self.poses[stamp][:3, :3], self.poses[stamp][:3, 3] = result.rotation[stamp], result.translation[stamp]
-        self.covariance = lambda gradients: function_covariance(
-            gradients, result.rotation, result.translation, result.points, **arrays
-        )
+        self.covariance = lambda gradients: function_covariance(gradients, result, loss_scale=loss_scale)
         ellipses = {stamp: exact_ellipses([BOARD], [true[stamp]], noise=0.03, rng=rng) for stamp in range(views)}
         seen_boards = {stamp: identify(found, (BOARD,), CAMERA) for stamp, found in ellipses.items()}
         self.evidence = Evidence(Targets((BOARD,)), seen_boards, ellipses)
