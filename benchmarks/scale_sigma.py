@@ -25,8 +25,8 @@ from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.geometry import similarity
 from pipeprog_sfm.mapper import Mapper
-from pipeprog_sfm.placement import similarity
 from pipeprog_sfm.scale import ScaleEstimate
 from pipeprog_sfm.target_file import load_targets
 

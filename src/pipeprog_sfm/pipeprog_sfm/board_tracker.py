@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.board import BoardObservation, identify
+from pipeprog_sfm.board import BoardObservation
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses, find_ellipses
+from pipeprog_sfm.identification import identify
 from pipeprog_sfm.metric import Evidence, estimate_scale
 from pipeprog_sfm.motion import Acceleration, Motion, TransformTree
 from pipeprog_sfm.scale import NoScaleError, PoseCovariance, ScaleEstimate

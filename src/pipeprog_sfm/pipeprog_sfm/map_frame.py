@@ -10,7 +10,7 @@ import numpy as np
 from pipeprog_sfm.board import symmetries
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.motion import Path
-from pipeprog_sfm.placement import PlacedBoard
+from pipeprog_sfm.placed_board import PlacedBoard
 
 STEEPEST = np.cos(np.radians(30.0))  # an axis nearer to the vertical tells no heading
 DISAGREEMENT = np.radians(5.0)  # of two verticals: more than a board hung by eye or a cheap accelerometer errs by

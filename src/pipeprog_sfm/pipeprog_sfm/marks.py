@@ -18,7 +18,9 @@ from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.conic import FloatArray, circles_from_conics, conic_score
 from pipeprog_sfm.ellipse import TargetEllipses
-from pipeprog_sfm.placement import LEAST_SINE, PlacedBoard, midpoints, place_circle
+from pipeprog_sfm.geometry import LEAST_SINE, midpoints
+from pipeprog_sfm.placed_board import PlacedBoard
+from pipeprog_sfm.placement import place_circle
 from pipeprog_sfm.target_file import MarkPair
 
 SAME_CONIC = 0.1  # conic score up to which two ellipses may show one disc, at the poses of a good reconstruction

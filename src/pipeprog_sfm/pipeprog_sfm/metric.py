@@ -9,6 +9,8 @@ import numpy as np
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.board import BoardObservation
+from pipeprog_sfm.board_adjustment import sensitivity
+from pipeprog_sfm.board_check import BoardPlacement, contradiction, measure
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.conic import FloatArray
 from pipeprog_sfm.ellipse import TargetEllipses
@@ -17,7 +19,8 @@ from pipeprog_sfm.map_frame import Vertical, board_vertical, camera_up, map_from
 from pipeprog_sfm.marks import MarksError, find_marks
 from pipeprog_sfm.motion import Acceleration, NoPathError, TransformTree
 from pipeprog_sfm.odometry import OdometryError, odometry_measurement
-from pipeprog_sfm.placement import BoardPlacement, PlacedBoard, contradiction, measure, place_boards, sensitivity
+from pipeprog_sfm.placed_board import PlacedBoard
+from pipeprog_sfm.placement import place_boards
 from pipeprog_sfm.rig import rig_measurements
 from pipeprog_sfm.scale import (
     Measurement,

@@ -13,9 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeprog_sfm.board_adjustment import Sensitivity
+from pipeprog_sfm.board_check import BoardPlacement
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.conic import FloatArray
-from pipeprog_sfm.placement import BoardPlacement, PlacedBoard, Sensitivity, cross_matrices
+from pipeprog_sfm.geometry import cross_matrices
+from pipeprog_sfm.placed_board import PlacedBoard
 from pipeprog_sfm.target_file import Distance
 
 # Of functions of the poses: (S, N, 6) derivatives, poses in order of time, -> (S, S).

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from targets import BOARD, CAMERA, Walk
 
-from pipeprog_sfm.board import Board, identify
+from pipeprog_sfm.board import Board
 from pipeprog_sfm.config import BoardConfig
+from pipeprog_sfm.identification import identify
 from pipeprog_sfm.metric import Evidence, estimate_scale
 from pipeprog_sfm.scale import NoScaleError
 from pipeprog_sfm.target_file import MarkPair, Targets

@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 from targets import BOARD, CAMERA, LOPSIDED, Walk, camera_from_board, exact_ellipses, render
 
 from pipeprog_sfm.adjustment import Bundle, adjust, function_covariance
-from pipeprog_sfm.board import Board, identify
+from pipeprog_sfm.board import Board
 from pipeprog_sfm.board_tracker import BoardTracker
 from pipeprog_sfm.config import BoardConfig
+from pipeprog_sfm.geometry import similarity
+from pipeprog_sfm.identification import identify
 from pipeprog_sfm.metric import Evidence, estimate_scale
-from pipeprog_sfm.placement import similarity
 from pipeprog_sfm.scale import NoScaleError
 from pipeprog_sfm.structure import StructureError, structure_vertical
 from pipeprog_sfm.target_file import Distance, Targets
