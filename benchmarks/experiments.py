@@ -31,8 +31,8 @@ from benchmarks.recordings import ROOT, Recording, site
 from benchmarks.survey import COMMAND, RESULTS, RUNS, attempt, commit
 from pipeprog_bringup import picture
 from pipeprog_bringup.cloud_io import read_cloud
-from pipeprog_bringup.report import read_survey
 from pipeprog_bringup.score import score_files
+from pipeprog_bringup.survey_folder import read_survey
 
 Known = dict[str, Any]
 

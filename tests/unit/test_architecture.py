@@ -27,7 +27,7 @@ ALLOWED_IN_NODES = {"pipeprog_node", "pipeprog_msgs"}
 # The modules beside the cores' node.py that speak ROS.
 GLUE = {
     "pipeprog_node": {"parameters", "qos", "diagnostics", "messages", "main", "worker"},
-    "pipeprog_bringup": {"replay", "graph"},
+    "pipeprog_bringup": {"replay", "passage", "survey_files", "graph"},
 }
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|launch(_ros)?|tf2_ros|ament_index_python")
 

@@ -1,0 +1,139 @@
+"""Plots of the report, as SVG within the page."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+
+import matplotlib as mpl
+import numpy as np
+
+from pipeprog_bringup.survey_folder import Survey
+
+mpl.use("Agg")
+from matplotlib import dates
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+
+
+def plan(survey: Survey) -> Figure:
+    """Pipes and the camera's way seen from above."""
+    figure, axes = plt.subplots(figsize=(10, 5.5))
+    for pipe in survey.pipes:
+        cylinder = survey.cylinder(pipe)
+        color = survey.color(pipe["class"])
+        x, y = np.array([cylinder.start, cylinder.end])[:, :2].T
+        if np.hypot(*np.diff([x, y])) < cylinder.radius:
+            axes.add_patch(plt.Circle((x.mean(), y.mean()), cylinder.radius, facecolor=color, edgecolor="#333", lw=0.8))
+        else:
+            axes.plot(x, y, color="#333", lw=4.6, solid_capstyle="butt")
+            axes.plot(x, y, color=color, lw=3.4, solid_capstyle="butt")
+        axes.annotate(str(pipe["id"]), (x.mean(), y.mean()), (4, 5), textcoords="offset points", fontsize=8)
+    if survey.positions is not None:
+        x, y = survey.positions[:, :2].T
+        axes.plot(x, y, "-", color="#d9822b", lw=1.2, marker="o", ms=3, label="camera")
+        axes.plot(x[0], y[0], ">", color="#d9822b", ms=9, label="start")
+        axes.legend(frameon=False, fontsize=9)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    return _finished(figure)
+
+
+def radii_and_classes(survey: Survey) -> Figure:
+    """Metres by measured radius over the classes' bands, and each pipe's distance from its nominal radius."""
+    figure, (top, bottom) = plt.subplots(2, 1, figsize=(10, 6), height_ratios=(3, 2))
+    radii = np.array([1e3 * float(pipe["radius"]) for pipe in survey.pipes])
+    lengths = np.array([float(pipe["length"]) for pipe in survey.pipes])
+    nominal = {str(entry["class"]): 1e3 * float(entry["outer_radius"]) for entry in survey.classes}
+    highest = 1.15 * max(radii.max(), *nominal.values()) if nominal else 1.15 * radii.max()
+    bins = np.arange(0, highest + 2, 2.0)
+    for name, radius in nominal.items():
+        # 1 % of the diameter is what manufacture may deviate (EN 10255); a millimetre is the least that shows.
+        band = max(0.02 * radius, 1.0)
+        top.axvspan(radius - band, radius + band, color=survey.color(name), alpha=0.22, lw=0)
+        top.annotate(
+            name,
+            (radius, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+        )
+    groups = [*nominal, None]
+    own = [np.array([pipe["class"] == name for pipe in survey.pipes], bool) for name in groups]
+    top.hist(
+        [radii[mask] for mask in own],
+        bins,
+        weights=[lengths[mask] for mask in own],
+        stacked=True,
+        color=[survey.color(name) for name in groups],
+        edgecolor="#333",
+        linewidth=0.5,
+    )
+    top.set(xlabel="measured outer radius [mm]", ylabel="length [m]", xlim=(0, highest))
+    for number, pipe in enumerate(survey.pipes):
+        if pipe["class"] not in nominal:
+            continue
+        sigma = 3e3 * float(pipe["radius_sigma"] or 0)
+        bottom.errorbar(number, radii[number] - nominal[pipe["class"]], sigma, color="#333", capsize=3, lw=1, zorder=1)
+        bottom.scatter(
+            number,
+            radii[number] - nominal[pipe["class"]],
+            40,
+            color=[survey.color(pipe["class"])],
+            edgecolor="#333",
+            lw=0.6,
+            zorder=2,
+        )
+    bottom.axhline(0, color="#888", lw=0.8)
+    bottom.set_xticks(
+        range(len(survey.pipes)),
+        [str(pipe["id"]) for pipe in survey.pipes],
+        fontsize=8,
+        rotation=90 if len(survey.pipes) > 20 else 0,
+    )
+    bottom.set(ylabel="radius - nominal [mm]\n(bars: 3 sigma)", xlim=(-0.7, len(survey.pipes) - 0.3))
+    return _finished(figure)
+
+
+def series(surveys: Sequence[Survey]) -> Figure:
+    """Installed metres of each class over the surveys, with what is planned."""
+    figure, axes = plt.subplots(figsize=(10, 4.2))
+    times = [survey.time for survey in surveys]
+    names = dict.fromkeys(str(entry["class"]) for survey in surveys for entry in survey.classes)
+    for name in names:
+        own = [next((c for c in survey.classes if str(c["class"]) == name), None) for survey in surveys]
+        installed = [np.nan if entry is None else float(entry["installed_m"]) for entry in own]
+        last = next(entry for entry in reversed(own) if entry is not None)
+        color = surveys[-1].color(name)
+        axes.plot(times, installed, "-o", color=color, lw=2, ms=6, mec="#333", mew=0.6, label=name)
+        axes.axhline(float(last["planned_m"]), color=color, lw=1, ls=":")
+    axes.set(ylabel="installed [m] (dotted: planned)")
+    axes.set_ylim(bottom=0)
+    axes.xaxis.set_major_formatter(dates.ConciseDateFormatter(axes.xaxis.get_major_locator()))
+    axes.legend(frameon=False, fontsize=9, ncols=3)
+    return _finished(figure)
+
+
+def _finished(figure: Figure) -> Figure:
+    for axes in figure.axes:
+        axes.grid(True, color="#e4e7ec", lw=0.7)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    return figure
+
+
+def svg(figure: Figure) -> str:
+    """A figure as an SVG element, and the figure closed."""
+    stream = io.StringIO()
+    # A fixed salt and no date: the same results give the same page.
+    with mpl.rc_context({"svg.hashsalt": "pipeprog"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    plt.close(figure)
+    text = stream.getvalue()
+    # Within HTML an SVG needs neither name spaces nor a description of itself.
+    text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
+    return re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)

@@ -1,0 +1,91 @@
+"""What a replay has found, written to its folder: the files of the survey, and out.mcap for viewers."""
+
+from __future__ import annotations
+
+import numpy as np
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Image
+
+from pipeprog_bringup import cdr, results
+from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.bag_writer import BagWriter
+from pipeprog_bringup.cloud_io import write_las, write_ply
+from pipeprog_bringup.frame_log import FrameLog
+from pipeprog_bringup.output import OutputFolder
+from pipeprog_bringup.passage import LastMessages, calibration
+from pipeprog_detect.classify import ClassProgress
+from pipeprog_detect.pipe import Cylinder, Pipe
+from pipeprog_msgs import msg
+from pipeprog_node import messages
+
+_SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}
+
+
+def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> tuple[list[Pipe], list[ClassProgress]]:
+    """pipes.json, progress.csv, cloud.ply, cloud.las, trajectory.tum, frames.csv; returns what the first two hold."""
+    pipes = [_pipe(pipe) for pipe in survey.pipes.pipes]
+    classes = [_progress(entry) for entry in survey.pipes.classes]
+    scale = results.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
+    results.write_pipes(folder.file("pipes.json"), pipes, classes, scale)
+    results.write_progress(folder.file("progress.csv"), pipes, classes)
+    points, normals = messages.points_from_cloud(survey.cloud)
+    colors = messages.colors_from_cloud(survey.cloud)
+    write_ply(folder.file("cloud.ply"), points, colors, normals)
+    write_las(folder.file("cloud.las"), points, colors, normals)
+    poses = [pose.pose for pose in survey.poses.poses]
+    results.write_trajectory(
+        folder.file("trajectory.tum"),
+        [messages.stamp_ns(pose.header.stamp) for pose in survey.poses.poses],
+        np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
+        np.array([[p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w] for p in poses]),
+    )
+    results.write_frames(folder.file("frames.csv"), log.rows())
+    return pipes, classes
+
+
+def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmStatus) -> None:
+    """The results into out.mcap, at the time of the first keyframe: a viewer shows them from the start."""
+    stamp = messages.stamp_ns(survey.poses.poses[0].header.stamp)
+    recorded = [(topic, getattr(survey, name)) for name, topic in _SURVEY_TOPICS.items()] + [("sfm_status", status)]
+    for topic, message in recorded:
+        recording.write(f"/{topic}", _type_name(type(message)), serialize_message(message), stamp)
+
+
+def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
+    """The keyframes into out.mcap, with the calibration that each went out with."""
+    chosen = {row.stamp for row in log.rows() if row.chosen}
+    for frame in bag:
+        if frame.stamp not in chosen or not cdr.is_whole(frame.data, bag.image_type):
+            continue
+        chosen.remove(frame.stamp)
+        data = frame.data
+        if bag.image_type == cdr.IMAGE:
+            encoded = messages.encode_jpeg(messages.image_from_msg(deserialize_message(data, Image)))
+            data = cdr.write_compressed_image(frame.stamp, frame.frame_id, "jpeg", encoded)
+        info = serialize_message(calibration(frame))
+        recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, info, frame.stamp)
+        recording.write("/keyframes/image/compressed", cdr.COMPRESSED_IMAGE, data, frame.stamp)
+
+
+def _pipe(message: msg.Pipe) -> Pipe:
+    start, end = (np.array([point.x, point.y, point.z]) for point in (message.start, message.end))
+    return Pipe(
+        message.id,
+        Cylinder(start, end, message.radius),
+        message.radius_sigma,
+        message.class_name or None,
+        message.class_probability,
+        message.visible_arc,
+        message.rmse,
+        message.points,
+    )
+
+
+def _progress(message: msg.ClassProgress) -> ClassProgress:
+    planned, installed = message.planned_length, message.installed_length
+    return ClassProgress(message.class_name, message.outer_radius, planned, installed, 100 * installed / planned)
+
+
+def _type_name(kind: type) -> str:
+    """`package/msg/Name` of a message class."""
+    return f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
