@@ -22,7 +22,7 @@ from pipeprog_detect.growth import LEAST, grown
 from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.rim import End, find_end
-from pipeprog_detect.support import hits, support_profile
+from pipeprog_detect.support import MIN_SUPPORT, hits, support_profile
 
 # Pixels of outline that make one measurement: the mean over them tames texture, the line stays straight within.
 CHUNK = 12
@@ -47,8 +47,6 @@ MAX_GROWTH = 6
 WORSE, SAME_RADIUS = 0.9, 3.0
 # ... and where it has less than half, it was something else.
 LOST = 0.5
-# Cylinders that are not there stay under 0.1 (see `support`); the stated sigma grows where little is seen.
-MIN_SUPPORT = 0.15
 
 
 @dataclass(frozen=True)

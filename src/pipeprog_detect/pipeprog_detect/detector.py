@@ -19,10 +19,12 @@ from pipeprog_detect.inside import find_concave
 from pipeprog_detect.memory import Memory
 from pipeprog_detect.occlusion import with_depths
 from pipeprog_detect.octree import THREADS, Octree
+from pipeprog_detect.outline import viewing_direction
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
 from pipeprog_detect.refinement import Jury, Measured
 from pipeprog_detect.runs import elbows, join, near, spanning
+from pipeprog_detect.support import own_outlines
 from pipeprog_detect.surroundings import Surroundings
 from pipeprog_detect.verify import Candidate, measure, own_points, settle, thin_start
 
@@ -38,6 +40,8 @@ _PROPOSED = 2.0
 # Pipes up to this radius [m] are sought as lines of points, in neighbourhoods several times as wide.
 _THICKEST_LINE = 0.02
 _LINE_SCALE = 0.04
+# Of the walls points so far apart [m] suffice to tell where they are.
+_WALL_SPACING = 0.01
 
 Report = Callable[[float, str], None]
 
@@ -74,9 +78,11 @@ def detect(
     widest = 1.5 * max(planned.outer_radius for planned in bill.classes)
     report(0.15, "finding walls")
     walls, on_plane = background.find_planes(tree, sigma, widest)
+    plain = tree.subset(on_plane)
+    plain = plain.thinned(plain.level_of(_WALL_SPACING))
     tree = tree.subset(~on_plane)
     outward = None if cloud.normals is None else np.asarray(cloud.normals, float)[finite][tree.order]
-    around = Surroundings(tree, outward, walls)
+    around = Surroundings(tree, outward, walls, plain, sigma)
     if config.concave:
         report(0.3, "looking for pipes seen from inside")
         bores = [radius for planned in bill.classes for radius, _ in planned.bores]
@@ -99,8 +105,9 @@ def detect(
         memory.novelty.known = [_shifted(candidate.cylinder, shift) for candidate in candidates]
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
+    measured = _genuine(measured, around, judging)
     report(0.95, "looking for thin pipes in the keyframes")
-    measured += jury.measure_lost(points, _THICKEST_LINE, measured)
+    measured += _genuine(jury.measure_lost(points, _THICKEST_LINE, measured), around, judging)
     report(1.0, "done")
     return _product(measured, bill, shift, config)
 
@@ -223,6 +230,19 @@ def _settled(
         accepted = [candidate for candidate in measured if candidate is not None]
     bends = elbows([candidate.cylinder for candidate in accepted])
     return [candidate for number, candidate in enumerate(accepted) if number not in bends]
+
+
+def _genuine(measured: Sequence[Measured], around: Surroundings, views: Sequence[View]) -> list[Measured]:
+    """Those that stand before the walls and whose outlines are no others', as far as there are views to tell."""
+    if not views:
+        return list(measured)
+    clear = [
+        each
+        for each in measured
+        if not around.bury(each.cylinder, each.radius_sigma, viewing_direction(each.cylinder, views))
+    ]
+    own = own_outlines([each.cylinder for each in clear], views)
+    return [each for each, is_own in zip(clear, own, strict=True) if is_own]
 
 
 def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig, roughness: float = 1.0) -> bool:

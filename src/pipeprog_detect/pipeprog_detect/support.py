@@ -18,6 +18,9 @@ NEAR = 0.6
 SIGMA, EXPLAINED = 0.4, 0.2
 # A shadow's or a texture's edge agrees with the outline by chance in some views, but not in three and most of them.
 MIN_VIEWS, MIN_SHARE = 3, 0.5
+# Real pipes reach 0.5 and more, cylinders that are not there or a tenth too thick stay under 0.1; the stated sigma of
+# a radius grows where little is seen.
+MIN_SUPPORT = 0.15
 
 
 @dataclass(frozen=True)
@@ -53,11 +56,22 @@ def support_profile(at: Stations, hit: NDArray[np.bool_]) -> SupportProfile:
 
 
 def support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], chunk: int = 12) -> float:
-    """Share (0 to 1) of the cylinder's predicted outline with a supporting edge in at least three and most views.
-
-    Real pipes reach 0.5 and more, cylinders that are not there or a tenth too thick stay under 0.1.
-    """
+    """Share (0 to 1) of the cylinder's predicted outline with a supporting edge in at least three and most views."""
     basis = frame(cylinder, viewing_direction(cylinder, views))
     none = np.zeros(len(views))
     at, edges = outline_edges(cylinder, views, others, basis, none, 1.5, SHARP, chunk)
     return support_profile(at, hits(at, edges, none)).share if len(at) else 0.0
+
+
+def own_outlines(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArray[np.bool_]:
+    """Mask (N,): cylinders whose outlines are their own once all of them are known.
+
+    A cylinder that was measured before the one that hides it was found may have taken that one's edges for its
+    outlines: they leave it with less than a cylinder that is not there has.
+    """
+    kept = np.ones(len(cylinders), bool)
+    for number, cylinder in enumerate(cylinders):
+        others = [other for k, other in enumerate(cylinders) if k != number and kept[k]]
+        shown = support(cylinder, views, others)
+        kept[number] = shown >= MIN_SUPPORT or support(cylinder, views, []) < MIN_SUPPORT
+    return kept

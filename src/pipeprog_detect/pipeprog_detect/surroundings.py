@@ -1,4 +1,4 @@
-"""What the points around a cylinder say about its side: a pipe is seen from outside and rounds no corner."""
+"""What is around a cylinder says about its side: a pipe is seen from outside, rounds no corner, lies in no wall."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeprog_detect.background import Plane
 from pipeprog_detect.octree import IntArray, Octree
-from pipeprog_detect.pipe import FloatArray
+from pipeprog_detect.outline import frame
+from pipeprog_detect.pipe import Cylinder, FloatArray
 from pipeprog_detect.verify import Candidate
 
 # Mean cosine between the normals of a pipe and those of its points: noise turns a thin pipe's by less than 60 deg.
@@ -19,15 +20,26 @@ _ALONG = float(np.sin(np.radians(6.0)))
 _TANGENT = 0.15
 # Planes that meet at less than 30 deg make no corner.
 _CORNER = float(np.cos(np.radians(30.0)))
+# Walls are looked at in steps [m] of a cylinder's length, as far beside it as so many radii or metres, ...
+_STEP, _BESIDE, _LEAST_BESIDE = 0.05, 3.0, 0.03
+# ... aslant up to so many times as far before and behind it; so many points tell where one is.
+_ASLANT, _LEAST_POINTS = 3.0, 3
+# Walls are flat to so much [m] over that.
+_WAVINESS = 1e-3
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The points beside large planes, their normals (N, 3) towards the sensor (None: not known), and the planes."""
+    """The points beside large planes, their normals (N, 3) towards the sensor (None: not known), and the planes.
+
+    `walls`: points on the planes; `sigma` [m]: the cloud's noise.
+    """
 
     tree: Octree
     outward: FloatArray | None
     planes: Sequence[Plane]
+    walls: Octree
+    sigma: float
 
     def outwardness(self, candidate: Candidate) -> float | None:
         """Mean cosine between the normals of the points on a cylinder and its own, None where they are not known.
@@ -61,6 +73,27 @@ class Surroundings:
             return False
         front = self._surface(candidate)[1].mean(axis=0)
         return any(float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner) for corner in corners)
+
+    def bury(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
+        """Whether more than half of the cylinder, looked at along `towards` (3,), would lie within walls.
+
+        The outlines are seen where the view touches the cylinder, beside its axis and hardly nearer than that: a wall
+        that shows its own face nearer than the axis on both sides would hide both of them.
+        """
+        sideways, depth = frame(cylinder, towards)
+        reach = cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE)
+        rows = self.walls.near_segment(cylinder.start, cylinder.end, _ASLANT * reach)
+        offset = self.walls.points[rows] - cylinder.start
+        aside, behind = offset @ sideways, offset @ depth
+        bins = max(int(cylinder.length / _STEP), 4)
+        place = np.clip((offset @ cylinder.axis / cylinder.length * bins).astype(np.int64), 0, bins - 1)
+        clear = 3.0 * float(np.hypot(self.sigma, radius_sigma)) + _WAVINESS
+        buried = 0
+        for step in range(bins):
+            beside = (place == step) & (np.abs(aside) > cylinder.radius) & (np.abs(aside) < reach)
+            flanks = [behind[beside & (side * aside > 0)] for side in (-1.0, 1.0)]
+            buried += all(len(flank) >= _LEAST_POINTS and np.median(flank) < -clear for flank in flanks)
+        return buried > 0.5 * bins
 
     def _surface(self, candidate: Candidate) -> tuple[IntArray, FloatArray]:
         """Rows of the points on the cylinder's surface and the unit vectors (K, 3) from its axis to them."""
