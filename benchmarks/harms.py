@@ -54,7 +54,7 @@ def _shifted(project: Any) -> Any:
 
 HARMS = {
     "eccentricity of the circles left in": Harm(
-        "pipeprog_sfm.placement.circle_centre_images", _centres_as_imaged, "sfm"
+        "pipeprog_sfm.placed_board.circle_centre_images", _centres_as_imaged, "sfm"
     ),
     "half a pixel between COLMAP and ROS": Harm(
         "pipeprog_sfm.colmap._pixels", lambda _: lambda pixels: pixels.astype(float), "sfm"
