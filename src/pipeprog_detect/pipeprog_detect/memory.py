@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeprog_detect.contour import ContourFit
 from pipeprog_detect.novelty import Novelty
-from pipeprog_detect.outline import project
+from pipeprog_detect.outline import inside
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.runs import near
 
@@ -87,13 +87,7 @@ def _poses(cylinder: Cylinder, views: Sequence[View]) -> dict[int, FloatArray]:
     """camera_from_map (4, 4) by stamp of the views that may see the cylinder or what it grows to."""
     share = np.linspace(-0.5, 1.5, 9)[:, None]
     points = cylinder.start + share * (cylinder.end - cylinder.start)
-    result = {}
-    for view in views:
-        pixel, depth = project(view, points)
-        size = np.array([view.camera.width, view.camera.height])
-        if ((depth > 0.0) & (pixel > 0).all(axis=1) & (pixel < size).all(axis=1)).any():
-            result[view.stamp] = view.camera_from_map
-    return result
+    return {view.stamp: view.camera_from_map for view in views if inside(view, points).any()}
 
 
 def _unmoved(one: dict[int, FloatArray], other: dict[int, FloatArray]) -> bool:

@@ -105,6 +105,13 @@ def project(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return pixel, depth
 
 
+def inside(view: View, points: FloatArray) -> NDArray[np.bool_]:
+    """Which points (N, 3) of the map lie before the camera and within the image."""
+    pixel, depth = project(view, points)
+    size = np.array([view.camera.width, view.camera.height])
+    return np.asarray((depth > 0.05) & (pixel > 0).all(axis=1) & (pixel < size - 1).all(axis=1))
+
+
 def stations(
     cylinder: Cylinder, views: Sequence[View], basis: FloatArray, spacing: float, margin: float = 4.0
 ) -> Stations:

@@ -14,7 +14,7 @@ from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import ContourFit, refine
 from pipeprog_detect.extent import Run
 from pipeprog_detect.memory import Memory
-from pipeprog_detect.outline import viewing_direction
+from pipeprog_detect.outline import inside, viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.ribbons import DEPTH_SIGMA, laid, mean_centre, propose
 from pipeprog_detect.verify import Candidate, Evidence
@@ -23,7 +23,7 @@ from pipeprog_detect.verify import Candidate, Evidence
 CONVINCING = 0.5
 # The windows in which outlines are sought follow from the radius: where it changes by more, they are placed anew.
 SETTLED, MAX_ROUNDS = 0.1, 3
-# Views that suffice to tell a pipe from a shadow; to measure it all are used.
+# Views of a pipe that suffice to tell it from a shadow; to measure it all are used.
 FEW_VIEWS = 30
 # A planned size so near to a radius that is none is tried, and taken with so much of its outlines' support.
 NEAR_PLANNED, AS_GOOD = 0.15, 0.6
@@ -60,7 +60,6 @@ class Jury:
     def __init__(self, views: Sequence[View], bill: Bill, config: ContourConfig, memory: Memory | None = None) -> None:
         self._views, self._bill, self._config = views, bill, config
         self._memory = memory or Memory()
-        self._few = views[:: -(-len(views) // FEW_VIEWS)] if views else []
         self._refused: list[Cylinder] = []
 
     @property
@@ -75,7 +74,8 @@ class Jury:
         """
         if any(_alike(candidate.cylinder, refused) for refused in self._refused):
             return False
-        fit = self._as_planned(self._refined(candidate, [], self._few, follow=False), [])
+        views = few_showing(candidate.cylinder, self._views)
+        fit = self._as_planned(self._refined(candidate, [], views, follow=False), [])
         if fit is None or fit.support < CONVINCING or not self._is_planned(fit):
             self._refused.append(candidate.cylinder)
             return False
@@ -171,7 +171,7 @@ class Jury:
                 continue
             fit = self._by_lines(proposed, known, thin, follow=False)
             if fit is not None:
-                fit = self._followed(replace(fit.cylinder, radius=proposed.radius), points, known, thin)
+                fit = self._followed(fit, proposed.radius, points, known, thin)
             if fit is None or fit.cylinder.length < SLENDER * fit.cylinder.radius or _is_known(fit.cylinder, known):
                 continue
             lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma))
@@ -179,17 +179,25 @@ class Jury:
         return tuple(lost)
 
     def _followed(
-        self, piece: Cylinder, points: NDArray[np.floating], known: Sequence[Cylinder], radii: Sequence[float]
+        self,
+        piece: ContourFit,
+        radius: float,
+        points: NDArray[np.floating],
+        known: Sequence[Cylinder],
+        radii: Sequence[float],
     ) -> ContourFit | None:
-        """The whole of a pipe of which a piece was found by its lines.
+        """The whole of a pipe of the given radius of which a piece was found by its lines.
 
         Its depth, which lines seen from one height leave open, is that of the cloud's points (N, 3) before the wall.
         """
-        centre = mean_centre(piece, self._views)
-        at_depth = None if centre is None else laid(piece, points.astype(np.float32), centre)
-        depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * piece.radius
-        start, slope_sigma = _aligned(at_depth or piece, known, self._views)
-        return self._by_lines(start, known, radii, depth_sigma, slope_sigma)
+        slope_known_to = float(np.sqrt(piece.covariance[3, 3]))
+        start = replace(piece.cylinder, radius=radius)
+        start, slope_sigma = aligned(start, known, self._views, slope_known_to)
+        centre = mean_centre(start, self._views)
+        sloping = not np.isfinite(slope_sigma)
+        at_depth = None if centre is None else laid(start, points.astype(np.float32), centre, sloping)
+        depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * radius
+        return self._by_lines(at_depth or start, known, radii, depth_sigma, slope_sigma)
 
     def _by_lines(
         self,
@@ -240,23 +248,36 @@ class Jury:
         return best
 
 
+def few_showing(cylinder: Cylinder, views: Sequence[View]) -> list[View]:
+    """Views, spread evenly over those that show some of the cylinder."""
+    places = cylinder.start + np.linspace(0.0, 1.0, 9)[:, None] * (cylinder.end - cylinder.start)
+    showing = [view for view in views if inside(view, places).any()]
+    return showing[:: -(-len(showing) // FEW_VIEWS)] if showing else []
+
+
 def _is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
     """Whether the middle of the cylinder lies within a known one."""
     return any(_contains(other, 0.5 * (cylinder.start + cylinder.end)) for other in known)
 
 
-def _aligned(proposed: Cylinder, known: Sequence[Cylinder], views: Sequence[View]) -> tuple[Cylinder, float]:
+def aligned(
+    proposed: Cylinder, known: Sequence[Cylinder], views: Sequence[View], slope_known_to: float
+) -> tuple[Cylinder, float]:
     """The cylinder as parallel to the known ones of nearly its direction as its image allows, and how sure [rad].
 
-    Seen from one height alone, a level pipe may as well slope towards the cameras: what else runs there tells.
+    Seen from one height alone, a level pipe may as well slope towards the cameras: what else runs there tells, as far
+    as it differs by no more than the cylinder's own slope may be wrong, `slope_known_to` [rad].
     """
-    axes = np.array([other.axis * np.sign(other.axis @ proposed.axis) for other in known]).reshape(-1, 3)
-    axes = axes[axes @ proposed.axis > np.cos(NEARLY_PARALLEL)]
-    if len(axes) < LEAST_PARALLEL:
-        return proposed, np.inf
     middle = 0.5 * (proposed.start + proposed.end)
     across = np.cross(proposed.axis, viewing_direction(proposed, views))
     across = across / np.linalg.norm(across)
+    towards = np.cross(across, proposed.axis)
+    axes = np.array([other.axis * np.sign(other.axis @ proposed.axis) for other in known]).reshape(-1, 3)
+    steepest = max(np.tan(NEARLY_PARALLEL), 3.0 * slope_known_to)
+    slope = np.abs(axes @ towards) / (axes @ proposed.axis)
+    axes = axes[(np.abs(axes @ across) < np.sin(NEARLY_PARALLEL)) & (slope < steepest)]
+    if len(axes) < LEAST_PARALLEL:
+        return proposed, np.inf
     direction = np.median(axes, axis=0)
     spread = float(np.median(np.linalg.norm(axes - direction, axis=1)))
     direction = direction - (direction @ across) * across

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_detect.lines import Ribbons, ribbons, straight_edges
-from pipeprog_detect.outline import camera_centre, project
+from pipeprog_detect.outline import camera_centre, inside, project
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 
 # Lines are sought in views that differ by so much of the distance to what they see, and in no more than so many.
@@ -31,6 +31,8 @@ RELIEF_REACH = 4.0
 LAID_REACH = 0.3
 # Behind a thin pipe the cloud shows more of the wall than of it: so many percent of the points there are its own.
 FRONT = 10.0
+# Stereo draws a thin pipe to the wall, never to the camera: of the places along it so many show how near it is.
+FOREMOST = 0.25
 # Standard deviation of a hypothesis's depth, in radii of the pipe.
 DEPTH_SIGMA = 1.0
 # Hypotheses that are followed into all views.
@@ -355,9 +357,7 @@ def _overlap(ends: FloatArray, others: FloatArray) -> FloatArray:
 
 def _sees(axes: _Axes, eye: _Eye) -> NDArray[np.bool_]:
     """Which axes (H,) have their middle inside the view."""
-    pixel, depth = project(eye.view, axes.ends.mean(axis=1))
-    size = np.array([eye.view.camera.width, eye.view.camera.height])
-    return np.asarray((depth > 0.05) & (pixel > 0).all(axis=1) & (pixel < size - 1).all(axis=1))
+    return inside(eye.view, axes.ends.mean(axis=1))
 
 
 def _matches(axes: _Axes, eye: _Eye) -> NDArray[np.int64]:
@@ -458,12 +458,7 @@ def _accumulate(
 def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
     """Mean projection centre (3,) of the views that show the cylinder's middle, None where none does."""
     middle = 0.5 * (cylinder.start + cylinder.end)
-    centres = []
-    for view in views:
-        pixel, depth = project(view, middle[None])
-        size = np.array([view.camera.width, view.camera.height])
-        if depth[0] > 0.05 and (pixel > 0).all() and (pixel < size - 1).all():
-            centres.append(camera_centre(view))
+    centres = [camera_centre(view) for view in views if inside(view, middle[None])[0]]
     return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
 
 
@@ -499,8 +494,12 @@ def _sight(cylinder: Cylinder, centre: FloatArray) -> tuple[FloatArray, FloatArr
     return axis, towards, side
 
 
-def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) -> Cylinder | None:
-    """The cylinder at the depth of the nearest points (N, 3) that it hides from `centre`; None where there are few."""
+def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, sloping: bool = True) -> Cylinder | None:
+    """The cylinder at the depth of the nearest points (N, 3) that it hides from `centre`; None where there are few.
+
+    Where these lie no nearer than those beside it they are the wall's: the cloud does not show the pipe there. Unless
+    it is `sloping` it keeps its direction.
+    """
     axis, towards, side = _sight(cylinder, centre)
     depth = float((cylinder.start - centre) @ towards)
     offset = points - centre.astype(np.float32)
@@ -509,14 +508,24 @@ def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) ->
     offset, far = offset[near], far[near]
     place = (offset @ axis.astype(np.float32)) * depth / far - float((cylinder.start - centre) @ axis)
     aside = (offset @ side.astype(np.float32)) * depth / far
-    inner = (np.abs(aside) < 0.6 * cylinder.radius) & (place > 0) & (place < cylinder.length)
+    along = (place > 0) & (place < cylinder.length)
     bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
-    cell = np.clip((place[inner] / cylinder.length * bins).astype(int), 0, bins - 1)
-    front = _by_bin(cell, far[inner], bins, FRONT)
-    known = np.isfinite(front)
+    cell = np.clip((place / cylinder.length * bins).astype(int), 0, bins - 1)
+    inner = along & (np.abs(aside) < 0.6 * cylinder.radius)
+    front = _by_bin(cell[inner], far[inner], bins, FRONT)
+    flanks = []
+    for sign in (-1.0, 1.0):
+        beside = along & (sign * aside > 2.4 * cylinder.radius) & (sign * aside < 2.0 * RELIEF_REACH * cylinder.radius)
+        flanks.append(_by_bin(cell[beside], far[beside], bins, FRONT))
+    known = np.isfinite(front) & ~(np.fmax(*flanks) - front < cylinder.radius)
     if known.sum() < 0.3 * bins:
         return None
-    slope, level = _robust_line((np.arange(bins)[known] + 0.5) / bins, 1.0 / front[known])
+    at, inverse_front = (np.arange(bins)[known] + 0.5) / bins, 1.0 / front[known]
+    if sloping:
+        slope, level = _robust_line(at, inverse_front)
+    else:
+        slope = float(1.0 / ((cylinder.end - centre) @ towards) - 1.0 / depth)
+        level = float(np.quantile(inverse_front - slope * at, 1.0 - FOREMOST))
     inverse = np.array([level, level + slope])
     if (np.abs(depth * inverse - 1.0) > LAID_REACH * inverse).any():
         return None

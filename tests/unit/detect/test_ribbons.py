@@ -97,6 +97,22 @@ def test_a_thin_pipe_is_laid_at_the_depth_of_the_points_before_the_wall() -> Non
     assert laid(proposed, np.zeros((0, 3), np.float32), centre) is None
 
 
+def test_the_wall_beside_and_behind_a_pipe_does_not_lay_it() -> None:
+    """Stereo keeps half of a thin pipe and draws the rest to the wall, up to it: the depth is that of the near half."""
+    thin = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    centre = np.array([0.0, -1.2, 0.0])
+    near = front_points(Cylinder(thin.start, thin.start + 0.5 * thin.length * thin.axis, thin.radius))[::7]
+    rng = np.random.default_rng(5)
+    drawn = np.stack([rng.uniform(0.0, 0.3, 400), rng.uniform(0.0, WALL, 400), rng.uniform(-0.009, 0.009, 400)], axis=1)
+    points = np.concatenate([wall_points(), near, drawn]).astype(np.float32)
+    proposed = Cylinder(np.array([-0.31, 0.04, 0.0]), np.array([0.31, 0.04, 0.0]), thin.radius)
+    found = laid(proposed, points, centre, sloping=False)
+    assert found is not None
+    assert found.start[1] == pytest.approx(thin.start[1], abs=thin.radius)
+    assert found.end[1] == pytest.approx(thin.end[1], abs=thin.radius)
+    assert laid(proposed, wall_points().astype(np.float32), centre) is None
+
+
 def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:
     centre = mean_centre(PIPE, pipe_views)
     assert centre is not None
