@@ -22,7 +22,7 @@ from pipeprog_detect.octree import THREADS, Octree
 from pipeprog_detect.outline import viewing_direction
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
-from pipeprog_detect.refinement import Jury, Measured
+from pipeprog_detect.refinement import Jury, Measured, joined
 from pipeprog_detect.runs import elbows, join, near, spanning
 from pipeprog_detect.support import own_outlines
 from pipeprog_detect.surroundings import Surroundings
@@ -108,6 +108,7 @@ def detect(
     measured = _genuine(measured, around, judging)
     report(0.95, "looking for thin pipes in the keyframes")
     measured += _genuine(jury.measure_lost(points, _THICKEST_LINE, measured), around, judging)
+    measured = joined(measured)
     report(1.0, "done")
     return _product(measured, bill, shift, config)
 

@@ -17,6 +17,7 @@ from pipeprog_detect.memory import Memory
 from pipeprog_detect.outline import inside, viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.ribbons import DEPTH_SIGMA, laid, mean_centre, propose
+from pipeprog_detect.runs import join, spanning
 from pipeprog_detect.verify import Candidate, Evidence
 
 # Outlines of real pipes are supported along more than half of what is seen of them.
@@ -246,6 +247,17 @@ class Jury:
         best = max(fits, key=lambda fit: fit.support, default=None)
         self._memory.keep(cylinder, follow, others, views, best)
         return best
+
+
+def joined(measured: Sequence[Measured]) -> list[Measured]:
+    """Pieces of one pipe made one, as thick as the best measured: the cloud may show one, lines another."""
+    whole = []
+    for pieces in join([each.cylinder for each in measured]):
+        best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
+        cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
+        points = sum(measured[piece].candidate.points for piece in pieces)
+        whole.append(Measured(replace(measured[best].candidate, points=points), cylinder, measured[best].radius_sigma))
+    return whole
 
 
 def few_showing(cylinder: Cylinder, views: Sequence[View]) -> list[View]:
