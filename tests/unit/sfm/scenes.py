@@ -11,12 +11,17 @@ from numpy.typing import NDArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.adjustment import Bundle, rotation_from_vector
 from pipeprog_sfm.features import Features, root_sift
+from pipeprog_sfm.initialisation import model_of_pair
+from pipeprog_sfm.keyframe import Keyframe
+from pipeprog_sfm.matching import match
+from pipeprog_sfm.model import SparseModel
 
 VIEWS, POINTS = 6, 150
 FOCAL = 900.0
 CAMERA = Camera(1280, 720, 900.0, 900.0, 639.5, 359.5)
 NOISE = 0.3  # px
 STEP = 200_000_000  # ns
+BASE = 0.25  # m between two views, keyframes of the walk along the corner
 
 
 def bundle(noise: float, outliers: float = 0.0) -> Bundle:
@@ -34,6 +39,21 @@ def bundle(noise: float, outliers: float = 0.0) -> Bundle:
     rays[wrong] += rng.uniform(-50, 50, (wrong.sum(), 2)) / FOCAL
     start = np.arange(POINTS + 1) * VIEWS
     return Bundle(rotation, translation, points, start, view, rays, np.full((VIEWS, 2), FOCAL))
+
+
+def sparse_model() -> SparseModel:
+    """The bundle without noise as a model, its matches linked to tracks."""
+    truth = bundle(noise=0.0)
+    built = SparseModel()
+    rays = truth.rays.reshape(POINTS, VIEWS, 2)
+    for view in range(VIEWS):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = truth.rotation[view], truth.translation[view]
+        built.add_view(view, rays[:, view], truth.focal[view], pose)
+        if view:
+            own = np.arange(POINTS) + built.offsets[view]
+            built.link(np.repeat(own, view), (own[:, None] - POINTS * np.arange(1, view + 1)).ravel())
+    return built
 
 
 def corner(length: float = 6.0) -> NDArray[np.float64]:
@@ -132,3 +152,28 @@ def position_errors(found: dict[int, NDArray[Any]], truth: dict[int, NDArray[Any
     sign = np.diag([1, 1, np.linalg.det(u @ vt)])
     rotation, scale = u @ sign @ vt, (s * np.diag(sign)).sum() / (da**2).sum()
     return np.linalg.norm(scale * da @ rotation.T - db, axis=1)
+
+
+@lru_cache
+def keyframe(n: int) -> Keyframe:
+    """Number n of a walk along the corner."""
+    return Keyframe.of(n * STEP, view(pose(BASE * n), n), CAMERA)
+
+
+def matched(one: Keyframe, other: Keyframe) -> NDArray[np.int32]:
+    """All matches of two keyframes."""
+    return match(one.features.descriptors, other.features.descriptors)
+
+
+def started(first: int, second: int) -> SparseModel:
+    """The model of two keyframes of the walk."""
+    one, other = keyframe(first), keyframe(second)
+    model = model_of_pair(one, other, matched(one, other), seed=0)
+    assert model is not None
+    return model
+
+
+def in_model(first: int, second: int, n: int) -> NDArray[np.float64]:
+    """True centre of view n in the model that two others have started."""
+    origin, unit = pose(BASE * first), np.linalg.norm(centre(pose(BASE * first)) - centre(pose(BASE * second)))
+    return (origin[:3, :3] @ centre(pose(BASE * n)) + origin[:3, 3]) / unit

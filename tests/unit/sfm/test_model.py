@@ -4,28 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import FOCAL, POINTS, VIEWS, bundle
+from scenes import FOCAL, POINTS, VIEWS, bundle, sparse_model
 
 from pipeprog_sfm.adjustment import rotation_from_vector
-from pipeprog_sfm.model import SparseModel
-
-
-def model() -> SparseModel:
-    truth = bundle(noise=0.0)
-    built = SparseModel()
-    rays = truth.rays.reshape(POINTS, VIEWS, 2)
-    for view in range(VIEWS):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = truth.rotation[view], truth.translation[view]
-        built.add_view(view, rays[:, view], truth.focal[view], pose)
-        if view:
-            own = np.arange(POINTS) + built.offsets[view]
-            built.link(np.repeat(own, view), (own[:, None] - POINTS * np.arange(1, view + 1)).ravel())
-    return built
 
 
 def test_links_become_one_track_a_point() -> None:
-    built = model()
+    built = sparse_model()
     ids, start, _ = built.observations(np.ones(len(built.points), bool))
     assert len(ids) == POINTS
     assert (np.diff(start) == VIEWS).all()
@@ -33,7 +18,7 @@ def test_links_become_one_track_a_point() -> None:
 
 
 def test_a_moved_view_contradicts_its_matches() -> None:
-    built = model()
+    built = sparse_model()
     same = np.repeat(np.arange(POINTS, dtype=np.int32)[:, None], 2, axis=1)
     assert built.epipolar_errors(3, 2, same).max() < 1e-6
     built.translation[3] += [0.0, 0.1, 0.0]
@@ -41,14 +26,14 @@ def test_a_moved_view_contradicts_its_matches() -> None:
 
 
 def test_filter_drops_a_wrong_observation_and_a_point_without_parallax() -> None:
-    built = model()
+    built = sparse_model()
     built.rays[built.offsets[2] + 7] += 10 / FOCAL
     built.filter(*built.observations(np.ones(len(built.points), bool)))
     assert (built.point_of < 0).nonzero()[0].tolist() == [built.offsets[2] + 7]
 
 
 def test_drop_and_absorb_keep_the_tracks() -> None:
-    built, other = model(), model()
+    built, other = sparse_model(), sparse_model()
     built.drop(2)
     assert built.stamps == [0, 1, 3, 4, 5]
     ids, start, features = built.observations(np.ones(len(built.points), bool))
