@@ -19,6 +19,7 @@ from pipeprog_detect.edges import (
     sideways,
 )
 from pipeprog_detect.growth import LEAST, grown
+from pipeprog_detect.lone_limb import SeenArc, lone_limb, precision
 from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.rim import End, find_end
@@ -84,6 +85,7 @@ def refine(
     depth_sigma: float = 0.0,
     slope_sigma: float = np.inf,
     ends_known: bool = False,
+    seen: SeenArc | None = None,
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
@@ -92,7 +94,8 @@ def refine(
     pipe is made as long as its outlines are seen, and its ends are looked for. With `known_radius` outlines of other
     radii are not looked for; `depth_sigma` [m] is what the distance from the cameras is known to, where that is worse,
     and `slope_sigma` [rad] what the slope towards them is known to. With `ends_known` the surface was seen between the
-    given ends.
+    given ends. `seen` is what the cloud holds of it: where the others hide one of its outlines in all views it stands
+    for that one.
 
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
@@ -103,13 +106,16 @@ def refine(
     basis = frame(cylinder, viewing_direction(cylinder, views))
     expected = (initial_radius_sigma, known_radius, depth_sigma)
     candidates = _vote(cylinder, expected, views, others, basis, planned_radii)
-    if not len(candidates):
-        return None
     known_to = np.full(5, 2.0 * initial_radius_sigma)
     known_to[[1, 3]] = max(2.0 * initial_radius_sigma, depth_sigma)
     known_to[4] = np.inf
     slope = np.array([0.0, -1.0, 0.0, 1.0, 0.0]) / (slope_sigma * cylinder.length)
     prior = np.diag(1.0 / known_to**2) + np.outer(slope, slope)
+    if not len(candidates):
+        limb = None if seen is None else lone_limb(cylinder, views, others, basis, CHUNK)
+        if seen is None or limb is None:
+            return None
+        candidates, prior = np.zeros((1, 5)), precision(seen, limb)
     scene = (views, others, basis)
     still: FloatArray = np.zeros(len(views))
     blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, still, CHUNK)

@@ -13,10 +13,11 @@ from pipeprog_detect.classify import classify
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import ContourFit, refine
 from pipeprog_detect.extent import Run
+from pipeprog_detect.lone_limb import SeenArc
 from pipeprog_detect.memory import Memory
 from pipeprog_detect.outline import inside, viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.ribbons import DEPTH_SIGMA, laid, mean_centre, propose
+from pipeprog_detect.ribbons import DEPTH_SIGMA, covers, laid, mean_centre, propose
 from pipeprog_detect.runs import join, spanning
 from pipeprog_detect.verify import Candidate, Evidence
 
@@ -38,6 +39,8 @@ LINES_CONVINCING = 0.6
 LINE_DEPTH_SIGMA = 0.03
 # Pipes that run within so much of one direction are laid parallel, to so much; two may be so by chance.
 NEARLY_PARALLEL, PARALLEL_SIGMA, LEAST_PARALLEL = np.radians(5.0), np.radians(0.3), 3
+# The axes of pipes side by side are so many radii apart.
+TOUCHING = 2.0
 # Shorter than so many radii a pair of lines may be a hanger, a clamp, or chance.
 SLENDER = 20.0
 # A strip's edges stay where they are, a cylinder's outlines do not: halfway between, by so many standard deviations.
@@ -95,7 +98,7 @@ class Jury:
         for number in order:
             candidate = candidates[number]
             others = [cylinder for other, cylinder in current.items() if other != number]
-            fit = self._refined(candidate, others, self._views)
+            fit = self._refined(candidate, others, self._views, trusted=trusted[number])
             if fit is None and not (trusted[number] and (not self.sits or _resolved(candidate))):
                 continue
             # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate or a corner.
@@ -168,7 +171,7 @@ class Jury:
         known = [measured.cylinder for measured in found]
         lost: list[Measured] = []
         for proposed in propose(self._views, some, thin, known, MOST_LOST, self._memory.edges):
-            if _is_known(proposed, known):
+            if _is_known(proposed, known) or self._is_rival(proposed, lost):
                 continue
             fit = self._by_lines(proposed, known, thin, follow=False)
             if fit is not None:
@@ -178,6 +181,11 @@ class Jury:
             lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma))
             known.append(fit.cylinder)
         return tuple(lost)
+
+    def _is_rival(self, proposed: Cylinder, lost: Sequence[Measured]) -> bool:
+        """Whether the keyframes show it where they show one of the lost pipes: two cannot both be there."""
+        centre = mean_centre(proposed, self._views)
+        return centre is not None and any(covers(each.cylinder, proposed, centre, TOUCHING) for each in lost)
 
     def _followed(
         self,
@@ -220,7 +228,12 @@ class Jury:
         return classify(fit.cylinder.radius, fit.radius_sigma, self._bill).probability > 0.0
 
     def _refined(
-        self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View], follow: bool = True
+        self,
+        candidate: Candidate,
+        others: Sequence[Cylinder],
+        views: Sequence[View],
+        follow: bool = True,
+        trusted: bool = False,
     ) -> ContourFit | None:
         if not views:
             return None
@@ -231,6 +244,7 @@ class Jury:
         known, fit = self._memory.recall(cylinder, follow, others, views)
         if known:
             return fit
+        seen = SeenArc(candidate.evidence.arc, sigma) if trusted else None
         starts = [cylinder.radius]
         if candidate.blurred:  # the cloud does not know the radius: the planned ones within its reach are tried, too
             starts += [radius for radius in planned_radii if abs(radius - cylinder.radius) < 3.0 * sigma]
@@ -238,7 +252,9 @@ class Jury:
         for radius in starts:
             start = replace(cylinder, radius=radius)
             for _ in range(MAX_ROUNDS):
-                fit = refine(start, sigma, views, others, self._config, planned_radii, follow, ends_known=True)
+                fit = refine(
+                    start, sigma, views, others, self._config, planned_radii, follow, ends_known=True, seen=seen
+                )
                 if fit is None or abs(fit.cylinder.radius - start.radius) < SETTLED * start.radius:
                     break
                 start = _cut(fit.cylinder, cylinder)
