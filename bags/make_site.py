@@ -83,7 +83,7 @@ def make_site(
     fps: Annotated[float, typer.Option(help="frames per second", min=0.1)] = 5.0,
     seconds: Annotated[float | None, typer.Option(help="duration; lab: 16, field: the whole walk")] = None,
     speed: Annotated[float, typer.Option(help="walking speed, m/s", min=0.01)] = 0.75,
-    distance: Annotated[float, typer.Option(help="from the wall, m", min=0.5, max=3.5)] = 2.0,
+    distance: Annotated[float, typer.Option(help="from the wall, m", min=0.5, max=4.0)] = 2.0,
     wobble: Annotated[float, typer.Option(help="unsteadiness of the hand: 0 a rail, 1 a careful person", min=0)] = 1.0,
     richness: Annotated[float, typer.Option(help="texture: 1 rich, 0.2 freshly painted, 0 none", min=0, max=2)] = 1.0,
     tiled: Annotated[float, typer.Option(help="metres after which the walls' texture repeats, 0 never", min=0)] = 0.0,
