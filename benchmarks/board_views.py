@@ -4,7 +4,8 @@
 
 For each number of views that see the board, scales from random choices of that many, with the poses of surveys that are
 there already (folders of out/surveys, each with the recording it is of; the demo's where none are named); what each
-scale makes of one pipe's radius is set against the truth. Writes results/board_views.json and Figure 8.
+scale makes of one pipe's radius is set against the truth. Writes results/board_views.json and Figure 8. The errors of
+each survey are kept in its folder.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -39,14 +41,19 @@ PIPE = 0.0365  # m; the paper follows one pipe, and this is the lab's commonest
 FIGURE = ROOT / "docs" / "images" / "experiment_figure_8.png"
 VARIANTS = {"corrected": True, "as imaged": False}
 
-Errors = dict[tuple[str, int], list[tuple[float, float]]]
-
 
 def main(runs: Sequence[tuple[Path, Recording]]) -> None:
     """Print the table and write results/board_views.json and the figure, all surveys together."""
-    errors: Errors = defaultdict(list)
+    errors: defaultdict[tuple[str, int], list[tuple[float, float]]] = defaultdict(list)
     failures: Counter[tuple[str, int]] = Counter()
-    pipes = [_choose(run, recording, errors, failures) for run, recording in runs]
+    pipes = []
+    for run, recording in runs:
+        known = _kept(run, recording)
+        pipes.append(known["pipe"])
+        for choice in known["choices"]:
+            key = choice["variant"], choice["views"]
+            errors[key] += choice["errors"]
+            failures[key] += CHOICES - len(choice["errors"])
     rows = []
     for views in VIEWS:
         row: dict[str, float | int] = {"views": views}
@@ -71,27 +78,38 @@ def main(runs: Sequence[tuple[Path, Recording]]) -> None:
     _draw(rows)
 
 
-def _choose(run: Path, recording: Recording, errors: Errors, failures: Counter[tuple[str, int]]) -> str:
-    """Adds one survey's errors (scale [%], radius [mm]) of every choice; which pipe they are of."""
+def _kept(run: Path, recording: Recording) -> dict[str, Any]:
+    """Which pipe of a survey is followed, and the errors of every choice; measured where the survey is newer."""
+    kept = run / "board_views.json"
+    if not kept.exists() or kept.stat().st_mtime < (run / "pipes.json").stat().st_mtime:
+        kept.write_text(json.dumps(_choose(run, recording)) + "\n")
+    known: dict[str, Any] = json.loads(kept.read_text())
+    return known
+
+
+def _choose(run: Path, recording: Recording) -> dict[str, Any]:
+    """The pipe, and for each variant and number of views the errors (scale [%], radius [mm]) of the choices."""
     score = score_files(run / "pipes.json", recording.beside("truth.json"))
     pipe = min(score["pipes"], key=lambda entry: abs(entry["true_radius"] - PIPE))
     detected = json.loads((run / "pipes.json").read_text())["pipes"]
     measured = next(entry["radius"] for entry in detected if entry["id"] == pipe["id"])
+    choices = []
     for variant, corrected in VARIANTS.items():
         tracker, poses = tracked(run, recording.beside("board.yaml"), corrected)
         seeing = list(poses)
         for views in track([count for count in VIEWS if count <= len(seeing)], f"{run.name}, centres {variant}"):
             rng = np.random.default_rng(views)
+            errors = []
             for _ in range(CHOICES):
                 chosen = rng.choice(len(seeing), views, replace=False)
                 try:
                     factor = tracker.estimate({seeing[index]: poses[seeing[index]] for index in chosen}).scale
                 except NoScaleError:
-                    failures[variant, views] += 1
                     continue
                 scale = 100 * (factor * (1 + score["scale"]["error_percent"] / 100) - 1)
-                errors[variant, views].append((scale, 1e3 * (measured * factor - pipe["true_radius"])))
-    return f"{1e3 * pipe['true_radius']:g} mm of `{run.name}`"
+                errors.append((scale, 1e3 * (measured * factor - pipe["true_radius"])))
+            choices.append({"variant": variant, "views": views, "errors": errors})
+    return {"pipe": f"{1e3 * pipe['true_radius']:g} mm of `{run.name}`", "choices": choices}
 
 
 def _findings(rows: Sequence[dict[str, float | int]]) -> dict[str, float | int]:

@@ -171,7 +171,7 @@ def main() -> None:
     draw(cases)
     runs = [
         (RUNS / case.name, case.recording)
-        for case in cases
+        for case in due
         if (case.layout, case.method, case.overlap) == ("lab", "ours", OVERLAPS["lab"][-1])
         and "score" in (case.known() or {})
     ]
