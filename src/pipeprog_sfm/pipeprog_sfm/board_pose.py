@@ -1,10 +1,11 @@
 """The pose of a board by the ellipses of one image: from three of them, and refined on all.
 
-`circles` are rows of the board's centres, `members` the ellipses that show them, (K,) each; poses are (4, 4)
-camera_from_board, m; `matrix` is the camera's.
+Poses are (4, 4) camera_from_board, m; `matrix` is the camera's.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,6 +15,19 @@ from scipy.spatial.transform import Rotation
 from pipeprog_sfm.board import Board
 from pipeprog_sfm.conic import FloatArray, project_circles
 from pipeprog_sfm.ellipse import TargetEllipses
+
+
+@dataclass(frozen=True)
+class BoardFit:
+    """A pose, and what it explains: circles (K,), rows of the board's centres, and the ellipses (K,) that show them."""
+
+    pose: FloatArray
+    circles: NDArray[np.intp]
+    members: NDArray[np.intp]
+
+    def without(self, number: int) -> BoardFit:
+        """The same without one of its circles."""
+        return replace(self, circles=np.delete(self.circles, number), members=np.delete(self.members, number))
 
 
 def three_point_poses(points: FloatArray, pixels: FloatArray, matrix: FloatArray) -> list[FloatArray]:
@@ -28,43 +42,30 @@ def three_point_poses(points: FloatArray, pixels: FloatArray, matrix: FloatArray
     return poses
 
 
-def misfit(
-    ellipses: TargetEllipses,
-    board: Board,
-    matrix: FloatArray,
-    pose: FloatArray,
-    circles: NDArray[np.intp],
-    members: NDArray[np.intp],
-) -> FloatArray:
-    """(K,) how far ellipses are from what the pose predicts; up to 1 is agreement.
+def misfit(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> FloatArray:
+    """(K,) how far its ellipses are from what the pose predicts; up to 1 is agreement.
 
     Allowed are, for a centre, half a pixel or 3 % of the radius (lens, print), and for the outline one pixel or 5 %
     (exposure makes bright discs larger).
     """
-    centres, shapes = project_circles(matrix, pose, board.centres[circles], board.circle_radius)
+    centres, shapes = project_circles(matrix, fit.pose, board.centres[fit.circles], board.circle_radius)
     radii = np.sqrt(np.sqrt(np.abs(np.linalg.det(shapes))))
-    gaps = np.linalg.norm(centres - ellipses.centres[members], axis=1) / np.maximum(0.03 * radii, 0.5)
-    bends = np.linalg.norm(shapes - ellipses.shapes[members], axis=(1, 2)) / (2 * radii)
+    gaps = np.linalg.norm(centres - ellipses.centres[fit.members], axis=1) / np.maximum(0.03 * radii, 0.5)
+    bends = np.linalg.norm(shapes - ellipses.shapes[fit.members], axis=(1, 2)) / (2 * radii)
     return np.maximum(gaps, bends / np.maximum(0.05 * radii, 1.0))
 
 
-def refined(
-    ellipses: TargetEllipses,
-    board: Board,
-    matrix: FloatArray,
-    pose: FloatArray,
-    circles: NDArray[np.intp],
-    members: NDArray[np.intp],
-) -> FloatArray:
-    """The pose that fits the ellipses best (damped Gauss-Newton).
+def refined(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> BoardFit:
+    """The same with the pose that fits the ellipses best (damped Gauss-Newton).
 
     Residuals are the centres, to 0.1 px, and the shapes, to 0.5 px: the size of a disc suffers from exposure.
     """
-    centres, shapes = ellipses.centres[members], ellipses.shapes[members]
+    pose, points = fit.pose, board.centres[fit.circles]
+    centres, shapes = ellipses.centres[fit.members], ellipses.shapes[fit.members]
     size = 2 * np.sqrt(np.sqrt(np.abs(np.linalg.det(shapes))))[:, None]
 
     def residuals(candidate: FloatArray) -> FloatArray:
-        centre, shape = project_circles(matrix, candidate, board.centres[circles], board.circle_radius)
+        centre, shape = project_circles(matrix, candidate, points, board.circle_radius)
         bend = (shape - shapes)[:, [0, 1, 0], [0, 1, 1]] / size
         return np.concatenate([(centre - centres) / 0.1, bend / 0.5], axis=1).ravel()
 
@@ -88,7 +89,7 @@ def refined(
             damping *= 10
             if damping > 1e6:
                 break
-    return pose
+    return replace(fit, pose=pose)
 
 
 def _moved(pose: FloatArray, change: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations, islice
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.board import LEAST_CIRCLES, Board, BoardObservation, layouts, symmetries
-from pipeprog_sfm.board_pose import misfit, refined, three_point_poses
+from pipeprog_sfm.board_pose import BoardFit, misfit, refined, three_point_poses
 from pipeprog_sfm.conic import FloatArray, circle_centre_images, circles_from_conics, project_circles
 from pipeprog_sfm.ellipse import PROFILES, TargetEllipses
 
@@ -39,9 +40,9 @@ def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) 
     free[best] = True
     matrix, found, least = camera.matrix, [], []
 
-    def take(board: Board, pose: FloatArray, circles: NDArray[np.intp], members: NDArray[np.intp]) -> None:
-        free[members] = False
-        found.append(_observation(ellipses, board, matrix, *_upright(board, pose, circles), members))
+    def take(board: Board, fit: BoardFit) -> None:
+        free[fit.members] = False
+        found.append(_observation(ellipses, board, matrix, _upright(board, fit)))
 
     for board in (group[0] for group in layouts(boards)):
         for circles, members in islice(_hypotheses(ellipses, free, board, matrix), MAX_TRIALS):
@@ -50,14 +51,14 @@ def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) 
             fit = _verify(ellipses, free, board, camera, circles, members)
             if fit is None:
                 continue
-            if len(fit[1]) > LEAST_CIRCLES:
-                take(board, *fit)
+            if len(fit.circles) > LEAST_CIRCLES:
+                take(board, fit)
             else:
                 least.append((board, fit))
     # Three circles may fit by chance: they must not take an ellipse from a board of which more is seen.
     for board, fit in least:
-        if free[fit[2]].all():
-            take(board, *fit)
+        if free[fit.members].all():
+            take(board, fit)
     return found
 
 
@@ -80,27 +81,18 @@ def identify_predicted(
     faces_camera = camera_from_board[:3, 2] @ camera_from_board[:3, 3] < 0
     if not faces_camera or depths.min() <= board.circle_radius or not len(ellipses):
         return None
-    circles, members = _matches(ellipses, np.ones(len(ellipses), bool), board, camera.matrix, camera_from_board, 0.5)
-    if not len(circles):
-        return None
-    return _observation(ellipses, board, camera.matrix, camera_from_board, circles, members)
+    fit = _explained(ellipses, np.ones(len(ellipses), bool), board, camera.matrix, camera_from_board, 0.5)
+    return _observation(ellipses, board, camera.matrix, fit) if len(fit.circles) else None
 
 
-def _observation(
-    ellipses: TargetEllipses,
-    board: Board,
-    matrix: FloatArray,
-    pose: FloatArray,
-    circles: NDArray[np.intp],
-    members: NDArray[np.intp],
-) -> BoardObservation:
-    order = np.argsort(circles)
-    circles, members = circles[order], members[order]
+def _observation(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> BoardObservation:
+    order = np.argsort(fit.circles)
+    circles, members = fit.circles[order], fit.members[order]
     conics = ellipses.conics[members]
     # Two of the five parameters of an ellipse through evenly spread points: variance 2 / n of that of a point.
     sigma = float(np.sqrt(2.0 / PROFILES * np.mean(ellipses.rms[members] ** 2)))
-    centres = circle_centre_images(conics, matrix, pose[:3, 2])
-    return BoardObservation(board.name, circles, centres, ellipses.centres[members], conics, sigma, pose)
+    centres = circle_centre_images(conics, matrix, fit.pose[:3, 2])
+    return BoardObservation(board.name, circles, centres, ellipses.centres[members], conics, sigma, fit.pose)
 
 
 def _hypotheses(
@@ -168,8 +160,8 @@ def _verify(
     camera: Camera,
     circles: NDArray[np.intp],
     members: NDArray[np.intp],
-) -> tuple[FloatArray, NDArray[np.intp], NDArray[np.intp]] | None:
-    """The refined pose, its circles and their ellipses, or None where they do not form the board.
+) -> BoardFit | None:
+    """The refined pose with all that it explains, or None where circles and ellipses (K,) do not form the board.
 
     The centres of three circles give up to four poses, and each predicts three whole ellipses: nine numbers to be
     refuted by. What survives is refined and has to fit in every circle.
@@ -179,24 +171,24 @@ def _verify(
     if _area(board.centres[circles[triple]]) < board.circle_radius**2:
         return None
     starts = three_point_poses(board.centres[circles[triple]], ellipses.centres[members[triple]], matrix)
-    misfits = [misfit(ellipses, board, matrix, start, circles, members)[triple].max() for start in starts]
+    fits = [BoardFit(start, circles, members) for start in starts]
+    misfits = [misfit(ellipses, board, matrix, fit)[triple].max() for fit in fits]
     if not misfits or min(misfits) > 4.0:
         return None
-    pose = starts[int(np.argmin(misfits))]
-    circles, members = _matches(ellipses, free, board, matrix, pose, 0.25)
-    while len(circles) >= LEAST_CIRCLES:
-        pose = refined(ellipses, board, matrix, pose, circles, members)
-        off = misfit(ellipses, board, matrix, pose, circles, members)
+    fit = _explained(ellipses, free, board, matrix, starts[int(np.argmin(misfits))], 0.25)
+    while len(fit.circles) >= LEAST_CIRCLES:
+        fit = refined(ellipses, board, matrix, fit)
+        off = misfit(ellipses, board, matrix, fit)
         if off.max() <= 1.0:
             break
-        circles, members = np.delete(circles, off.argmax()), np.delete(members, off.argmax())
-    if len(circles) < LEAST_CIRCLES:
+        fit = fit.without(int(off.argmax()))
+    if len(fit.circles) < LEAST_CIRCLES:
         return None
     # Circles that the image should show as well but does not: some may be hidden, not most of them.
-    centres, shapes = project_circles(matrix, pose, board.centres, board.circle_radius)
+    centres, shapes = project_circles(matrix, fit.pose, board.centres, board.circle_radius)
     reach = np.sqrt(np.abs(shapes[:, [0, 1], [0, 1]])) + 4.0
     within = ((centres > reach) & (centres < np.array([camera.width, camera.height]) - reach)).all(1)
-    return (pose, circles, members) if 2 * len(circles) > within.sum() else None
+    return fit if 2 * len(fit.circles) > within.sum() else None
 
 
 def _area(corners: FloatArray) -> float:
@@ -205,15 +197,15 @@ def _area(corners: FloatArray) -> float:
     return 0.5 * abs(float(ax * by - ay * bx))
 
 
-def _matches(
+def _explained(
     ellipses: TargetEllipses,
     free: NDArray[np.bool_],
     board: Board,
     matrix: FloatArray,
     pose: FloatArray,
     gate: float,
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Circles and the free ellipses within `gate` radii of where the pose puts them, one for one."""
+) -> BoardFit:
+    """The pose with the circles that have a free ellipse within `gate` radii of where it puts them, one for one."""
     centres, shapes = project_circles(matrix, pose, board.centres, board.circle_radius)
     predicted = np.sqrt(np.maximum(np.linalg.eigvalsh(shapes), 1e-12))
     measured = np.sqrt(np.maximum(np.linalg.eigvalsh(ellipses.shapes), 1e-12))
@@ -223,14 +215,14 @@ def _matches(
     gaps[sizes > np.maximum(0.2 * predicted[:, 1], 1.5)[:, None]] = np.inf
     nearest = gaps.argmin(1)
     circles = np.flatnonzero((gaps.min(1) < gate) & (gaps.argmin(0)[nearest] == np.arange(len(nearest))))
-    return circles, nearest[circles]
+    return BoardFit(pose, circles, nearest[circles])
 
 
-def _upright(board: Board, pose: FloatArray, circles: NDArray[np.intp]) -> tuple[FloatArray, NDArray[np.intp]]:
-    """The pose and circle numbers among those that the board's symmetry allows with y up in the image."""
+def _upright(board: Board, fit: BoardFit) -> BoardFit:
+    """Of the fits that the board's symmetry allows the one with y up in the image."""
     orders = symmetries(board)
-    if len(orders) == 1 or pose[1, 1] <= 0:
-        return pose, circles
+    if len(orders) == 1 or fit.pose[1, 1] <= 0:
+        return fit
     turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     turn[:3, 3] = 2 * board.centres.mean(0)
-    return pose @ turn, orders[1][circles]
+    return replace(fit, pose=fit.pose @ turn, circles=orders[1][fit.circles])
