@@ -35,6 +35,8 @@ FRONT = 10.0
 FOREMOST = 0.25
 # Standard deviation of a hypothesis's depth, in radii of the pipe.
 DEPTH_SIGMA = 1.0
+# Lines that pass so many radii beside each other are the same: a highlight or a shadow lies a radius off an outline.
+SAME_LINE = 0.5
 # Hypotheses that are followed into all views.
 MOST_HYPOTHESES = 4000
 
@@ -77,8 +79,9 @@ def propose(
 
     `points` (N, 3) of the cloud bound the depths of each view. A ribbon of a view and a radius make a cylinder: its
     depth follows from the ribbon's width, and from the centre line of another view's ribbon where the camera has moved
-    across the pipe. Ribbons within the silhouette of a `known` cylinder are left out. `edges` remembers the images'
-    edges by stamp and width.
+    across the pipe. Ribbons within the silhouette of a `known` cylinder are left out. An outline
+    with a shadow's edge or a highlight beside it makes a rival of the pipe: both are proposed. `edges` remembers the
+    images' edges by stamp and width.
     """
     lines = {} if edges is None else edges
     eyes = [eye for eye in (_eye(view, points, radii, known, lines) for view in _few(views, points)) if eye is not None]
@@ -108,7 +111,7 @@ def propose(
         if count[best] < max(MIN_VIEWS, MIN_SHARE * seen[best]):
             break
         cylinder = Cylinder(axes.ends[best, 0], axes.ends[best, 1], float(axes.radius[best]))
-        covering = [k for k in range(len(found)) if _covers(found[k], cylinder, centres[k])]
+        covering = [k for k in range(len(found)) if covers(found[k], cylinder, centres[k], SAME_LINE)]
         if covering:
             found[covering[0]] = _spanning(found[covering[0]], cylinder, centres[covering[0]])
         elif len(found) < limit:
@@ -462,8 +465,11 @@ def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
     return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
 
 
-def _covers(one: Cylinder, other: Cylinder, centre: FloatArray) -> bool:
-    """Whether two cylinders look, from `centre`, like pieces of one: their depths are what is known worst."""
+def covers(one: Cylinder, other: Cylinder, centre: FloatArray, radii: float) -> bool:
+    """Whether two cylinders look, from `centre`, like pieces of one: their depths are what is known worst.
+
+    Their lines of sight may pass so many radii beside each other.
+    """
     axis, towards, side = _sight(one, centre)
     ends = np.stack([other.start, other.end]) - centre
     depth = float((one.start - centre) @ towards)
@@ -471,7 +477,7 @@ def _covers(one: Cylinder, other: Cylinder, centre: FloatArray) -> bool:
     aside = (ends @ side) * depth / (ends @ towards)
     gap = max(float(place.min()) - one.length, -float(place.max()))
     in_front = float((ends @ towards).min()) > 0.5 * depth
-    return in_front and float(np.abs(aside).max()) < 2.0 * one.radius and gap < 0.3
+    return in_front and float(np.abs(aside).max()) < radii * one.radius and gap < 0.3
 
 
 def _spanning(one: Cylinder, other: Cylinder, centre: FloatArray) -> Cylinder:

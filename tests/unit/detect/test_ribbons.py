@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import refine
 from pipeprog_detect.lines import ribbons, straight_edges
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.ribbons import laid, mean_centre, propose
+from pipeprog_detect.ribbons import SAME_LINE, covers, laid, mean_centre, propose
 
 # The pipe and the wall of `pipe_views`; the shadow on the wall is as wide as a pipe of this radius.
 PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
@@ -131,3 +133,16 @@ def test_a_known_slope_holds_what_one_height_leaves_open(pipe_views: list[View])
     assert held is not None
     turned = [np.arccos(min(abs(float(fit.cylinder.axis @ sloping.axis)), 1.0)) for fit in (free, held)]
     assert turned[1] < 0.5 * turned[0]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(-3.0, 3.0), st.floats(0.85, 1.15), st.floats(-0.5, 1.0))
+def test_lines_are_pieces_of_one_pipe_by_what_the_image_shows(radii: float, farther: float, ahead: float) -> None:
+    """Whatever their depths: beside each other by less than the given radii, and no farther on than a clamp hides."""
+    one = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    centre = np.array([0.0, -1.2, 0.0])
+    moved = np.array([ahead, 0.0, radii * one.radius])
+    other = Cylinder(*(centre + farther * (end + moved - centre) for end in (one.start, one.end)), one.radius)
+    for allowed in (SAME_LINE, 2.0):
+        if abs(abs(radii) - allowed) > 1e-3 and abs(ahead - 0.9) > 1e-3:
+            assert covers(one, other, centre, allowed) == (abs(radii) < allowed and ahead < 0.9)
