@@ -57,8 +57,9 @@ class ContourFit:
     `covariance` (5, 5) of the axis' offset at its middle (2) [m], its direction (2) [rad] and the radius [m], the
     directions being those of `basis` (2, 3); `support` share of the outline with an edge in three views or more;
     `views` number of views used; `start_sigma`, `end_sigma` [m], NaN where the images do not show that end and the
-    given one stands. `flatness`, with its standard deviation `flatness_sigma`: 0 for a cylinder, whose outlines keep
-    their distance from the axis from all sides; 1 for a painted strip or a joint, whose edges stay where they are.
+    given one stands; `rims` what speaks for a rim at the start and at the end (`rim.End.odds`). `flatness`, with its
+    standard deviation `flatness_sigma`: 0 for a cylinder, whose outlines keep their distance from the axis from all
+    sides; 1 for a painted strip or a joint, whose edges stay where they are.
     """
 
     cylinder: Cylinder
@@ -69,6 +70,7 @@ class ContourFit:
     views: int
     start_sigma: float
     end_sigma: float
+    rims: tuple[float, float]
     flatness: float
     flatness_sigma: float
 
@@ -381,5 +383,6 @@ def _result(refined: _Refined, basis: FloatArray, views: Sequence[View], ends: S
         len(np.unique(at.view[solution.used])),
         start.sigma if start else float("nan"),
         end.sigma if end else float("nan"),
+        (start.odds if start else 0.0, end.odds if end else 0.0),
         *_flatness(refined, views),
     )

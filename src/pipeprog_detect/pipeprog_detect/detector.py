@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.errors import InputError
 from pipeprog_detect import background, classify, hypotheses, normals, octree
+from pipeprog_detect.abutment import abutted
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.hypotheses import Hypothesis
@@ -108,7 +109,7 @@ def detect(
     measured = _genuine(measured, around, judging)
     report(0.95, "looking for thin pipes in the keyframes")
     measured += _genuine(jury.measure_lost(points, _THICKEST_LINE, measured), around, judging)
-    measured = joined(measured)
+    measured = _abutted(joined(measured), around, judging)
     report(1.0, "done")
     return _product(measured, bill, shift, config)
 
@@ -244,6 +245,20 @@ def _genuine(measured: Sequence[Measured], around: Surroundings, views: Sequence
     ]
     own = own_outlines([each.cylinder for each in clear], views)
     return [each for each, is_own in zip(clear, own, strict=True) if is_own]
+
+
+def _abutted(measured: Sequence[Measured], around: Surroundings, views: Sequence[View]) -> list[Measured]:
+    """The pipes as long as the walls that they run into allow, as far as there are views to tell."""
+    if not views:
+        return list(measured)
+    cylinders = [each.cylinder for each in measured]
+
+    def one(number: int) -> Measured:
+        others = cylinders[:number] + cylinders[number + 1 :]
+        each = measured[number]
+        return replace(each, cylinder=abutted(each.cylinder, each.rims, around.planes, around.walls, views, others))
+
+    return [one(number) for number in range(len(measured))]
 
 
 def is_pipe(candidate: Candidate, sigma: float, config: DetectConfig, roughness: float = 1.0) -> bool:

@@ -51,11 +51,15 @@ RESOLVED_RADII, RESOLVED_ARC = 5.0, np.radians(120.0)
 
 @dataclass(frozen=True)
 class Measured:
-    """A candidate after the images were asked: its cylinder and the standard deviation of its radius [m]."""
+    """A candidate after the images were asked: its cylinder and the standard deviation of its radius [m].
+
+    `rims`: what the images say for a rim at its start and at its end (`rim.End.odds`).
+    """
 
     candidate: Candidate
     cylinder: Cylinder
     radius_sigma: float
+    rims: tuple[float, float] = (0.0, 0.0)
 
 
 class Jury:
@@ -114,7 +118,7 @@ class Jury:
             elif not self._is_planned(fit) and _contradict(candidate, fit):
                 measured = Measured(candidate, *_by_the_cloud(candidate, fit))
             else:
-                measured = Measured(candidate, fit.cylinder, fit.radius_sigma)
+                measured = Measured(candidate, fit.cylinder, fit.radius_sigma, fit.rims)
             middle = 0.5 * (measured.cylinder.start + measured.cylinder.end)
             if not any(_contains(known.cylinder, middle) for known in found):
                 current[number] = measured.cylinder
@@ -178,7 +182,7 @@ class Jury:
                 fit = self._followed(fit, proposed.radius, points, known, thin)
             if fit is None or fit.cylinder.length < SLENDER * fit.cylinder.radius or _is_known(fit.cylinder, known):
                 continue
-            lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma))
+            lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma, fit.rims))
             known.append(fit.cylinder)
         return tuple(lost)
 
@@ -272,7 +276,13 @@ def joined(measured: Sequence[Measured]) -> list[Measured]:
         best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
         cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
         points = sum(measured[piece].candidate.points for piece in pieces)
-        whole.append(Measured(replace(measured[best].candidate, points=points), cylinder, measured[best].radius_sigma))
+        along = sorted(
+            (float(end @ cylinder.axis), rim)
+            for piece in (measured[number] for number in pieces)
+            for end, rim in zip((piece.cylinder.start, piece.cylinder.end), piece.rims, strict=True)
+        )
+        candidate, rims = replace(measured[best].candidate, points=points), (along[0][1], along[-1][1])
+        whole.append(Measured(candidate, cylinder, measured[best].radius_sigma, rims))
     return whole
 
 

@@ -25,6 +25,8 @@ SAMPLES_PER_PIXEL = 2
 PLAUSIBLE, RIM_WORTH = 8.0, 25.0
 # The edge of what hides the barrel is none of it: so many pixels beside it are left out.
 BESIDE_HIDDEN = 4
+# A rim's own edge is so many pixels wide.
+BESIDE_RIM = 4
 # What is hidden is no visible barrel: without a rim to show for it the pipe ends before it.
 UNSEEN = 1.0
 # Of two rims the inner one ends the barrel: an elbow or a collar has further rims outside.
@@ -38,10 +40,14 @@ FATTENED, THICKNESS = 0.02, 0.006
 
 @dataclass(frozen=True)
 class End:
-    """Where a pipe ends: `position` outwards from the given end and its standard deviation [m]."""
+    """Where a pipe ends: `position` outwards from the given end and its standard deviation [m].
+
+    `odds`: logarithm of how much more probable the edges there are on a rim than beside one.
+    """
 
     position: float
     sigma: float
+    odds: float
 
 
 def find_end(
@@ -88,7 +94,11 @@ def find_end(
         odds = odds - np.log1p(((position - surface_end) / SURFACE_SIGMA) ** 2)
     likely = np.interp(along, position, odds) - float(odds.max())
     score = np.where(likely > -PLAUSIBLE, likely + RIM_WORTH * vote, -np.inf)
-    return _refined(strength, seen, along, int(np.argmax(score)), pixel)
+    best = int(np.argmax(score))
+    # A rim stands out among the edges across the barrel: beside another as strong nothing tells that this is it.
+    elsewhere = np.abs(np.arange(len(vote)) - best) > BESIDE_RIM * SAMPLES_PER_PIXEL
+    contrast = float(vote[best]) - max(float(vote[elsewhere].max(initial=0.0)), 0.0)
+    return End(*_refined(strength, seen, along, best, pixel), RIM_WORTH * max(contrast, 0.0))
 
 
 def _all_around(strength: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
@@ -142,8 +152,8 @@ def _slopes(
     return np.where(inside, gaussian_filter1d(mean, SAMPLES_PER_PIXEL, axis=1, order=1), np.nan)
 
 
-def _refined(strength: FloatArray, seen: FloatArray, along: FloatArray, best: int, pixel: float) -> End:
-    """The peak near sample `best` of each view, their median and its deviation."""
+def _refined(strength: FloatArray, seen: FloatArray, along: FloatArray, best: int, pixel: float) -> tuple[float, float]:
+    """The median of the peaks near sample `best` of each view, and its standard deviation [m]."""
     reach = 3 * SAMPLES_PER_PIXEL
     low, high = max(best - reach, 1), min(best + reach + 1, len(along) - 1)
     per_view = strength.reshape(-1, SECTORS, len(along)).sum(axis=1)
@@ -155,7 +165,7 @@ def _refined(strength: FloatArray, seen: FloatArray, along: FloatArray, best: in
         shift = 0.5 * (row[peak - 1] - row[peak + 1]) / bend if bend < 0 else 0.0
         places.append(along[peak] + np.clip(shift, -0.5, 0.5) * (along[1] - along[0]))
     if not places:
-        return End(float(along[best]), 2.0 * pixel)
+        return float(along[best]), 2.0 * pixel
     position = float(np.median(places))
     scatter = 1.4826 * float(np.median(np.abs(np.array(places) - position)))
-    return End(position, float(np.hypot(1.25 * scatter / np.sqrt(len(places)), 0.5 * pixel)))
+    return position, float(np.hypot(1.25 * scatter / np.sqrt(len(places)), 0.5 * pixel))

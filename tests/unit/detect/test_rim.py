@@ -51,3 +51,10 @@ def test_the_edge_of_what_hides_a_pipe_is_not_its_end(pipe_views: list[View]) ->
     hides = Cylinder(across - np.array([0.5, 0.0, 0.0]), across + np.array([0.5, 0.0, 0.0]), 0.06)
     found = find_end(PIPE, True, pipe_views, [hides], np.zeros(len(pipe_views)), 0.5, 0.0)
     assert found is None or -0.06 < found.position < END_TOLERANCE
+
+
+def test_a_rim_speaks_for_an_end(pipe_views: list[View]) -> None:
+    still = np.zeros(len(pipe_views))
+    found = find_end(PIPE, True, pipe_views, [], still, 0.5, None)
+    assert found is not None
+    assert found.odds > 1.0
