@@ -142,7 +142,8 @@ def test_lines_are_pieces_of_one_pipe_by_what_the_image_shows(radii: float, fart
     one = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
     centre = np.array([0.0, -1.2, 0.0])
     moved = np.array([ahead, 0.0, radii * one.radius])
-    other = Cylinder(*(centre + farther * (end + moved - centre) for end in (one.start, one.end)), one.radius)
+    start, end = (centre + farther * (end + moved - centre) for end in (one.start, one.end))
+    other = Cylinder(start, end, one.radius)
     for allowed in (SAME_LINE, 2.0):
         if abs(abs(radii) - allowed) > 1e-3 and abs(ahead - 0.9) > 1e-3:
             assert covers(one, other, centre, allowed) == (abs(radii) < allowed and ahead < 0.9)
