@@ -60,9 +60,6 @@ HARMS = {
         "pipeprog_sfm.colmap._pixels", lambda _: lambda pixels: pixels.astype(float), "sfm"
     ),
     "half a pixel in the projection of rims": Harm("pipeprog_detect.rim.project", _shifted, "detect"),
-    "no gate by normals in the fit": Harm(
-        "pipeprog_detect.fit._gate", lambda _: lambda radial, *_: np.ones(len(radial)), "detect"
-    ),
     "no sector of the normals in the detector": Harm(
         "pipeprog_detect.verify._facing", lambda _: lambda points, *_: points, "detect"
     ),

@@ -54,11 +54,9 @@ def basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def fit_cylinder(
     points: FloatArray,
-    normals: FloatArray | None,
     initial: Cylinder,
     sigma: float,
     *,
-    signed: bool = False,
     fixed_radius: float | None = None,
     reach: float = 4.0,
     along_ray: bool = True,
@@ -67,10 +65,8 @@ def fit_cylinder(
 
     Minimises the geometric distance (faithful 5-parameter form of Lukacs, Marshall and Martin) with Tukey weights at
     the known noise `sigma` [m], annealed from `reach` times the final width: with the scale of the residuals instead,
-    a wall behind the pipe would count as noise and pull the radius up. Where normals (N, 3) are given, a point counts
-    only as far as its normal is radial: outward where `signed` (normals towards the sensor), either way otherwise;
-    zero normals are not judged. The covariance is the sandwich over blocks along the axis and sectors
-    around it, so noise that is alike in neighbouring points is not taken for independent.
+    a wall behind the pipe would count as noise and pull the radius up. The covariance is the sandwich over blocks
+    along the axis and sectors around it, so noise that is alike in neighbouring points is not taken for independent.
 
     Noise of cameras and scanners lies along the ray, so it moves a point across and along the surface together, and
     the plain geometric radius is too small by several noise variances over the radius. So the noise tensor of the
@@ -80,19 +76,16 @@ def fit_cylinder(
     """
     if len(points) < 10 or not sigma > 0:
         return None
-    given = normals if normals is not None else np.zeros((0, 3))
     middle = 0.5 * (initial.start + initial.end)
     radius = initial.radius if fixed_radius is None else fixed_radius
     free_radius = fixed_radius is None
     tensor = sigma**2 * np.eye(3)
-    ok, centre, axis, radius = _iterate(
-        points, given, signed, middle, initial.axis, radius, tensor, reach, free_radius, False
-    )
+    ok, centre, axis, radius = _iterate(points, middle, initial.axis, radius, tensor, reach, free_radius, False)
     for _ in range(_TENSOR_ROUNDS if along_ray else 0):
         if not ok or not np.isfinite(centre).all() or radius <= 0:
             return None
-        tensor = _noise_tensor(points, given, signed, centre, axis, radius, tensor, sigma)
-        ok, centre, axis, radius = _iterate(points, given, signed, centre, axis, radius, tensor, 1.0, free_radius, True)
+        tensor = _noise_tensor(points, centre, axis, radius, tensor, sigma)
+        ok, centre, axis, radius = _iterate(points, centre, axis, radius, tensor, 1.0, free_radius, True)
     if not ok or not np.isfinite(centre).all() or radius <= 0:
         return None
     offset = points - centre
@@ -100,8 +93,6 @@ def fit_cylinder(
     radial = offset - along[:, None] * axis
     distance = np.linalg.norm(radial, axis=1) - radius
     weight, foot, residual, spread = _weights(offset, axis, radius, tensor, along_ray)
-    if normals is not None:
-        weight *= _gate(radial, normals, signed)
     inliers = np.asarray((weight > 0) & (np.abs(residual) < 3.0 * spread))
     if inliers.sum() < 10:
         return None
@@ -136,21 +127,8 @@ def covered_arc(points: FloatArray, cylinder: Cylinder, bins: int = 72) -> float
     return float(max(len(part) for part in parts) * 2 * np.pi / bins)
 
 
-def _gate(radial: FloatArray, normals: FloatArray, signed: bool) -> FloatArray:
-    cosine = np.einsum("ij,ij->i", radial, normals) / np.maximum(np.linalg.norm(radial, axis=1), 1e-12)
-    gate = np.clip(((cosine if signed else np.abs(cosine)) - 0.6) / 0.3, 0.0, 1.0)
-    return np.where((normals == 0).all(axis=1), 1.0, gate)
-
-
 def _noise_tensor(
-    points: FloatArray,
-    normals: FloatArray,
-    signed: bool,
-    centre: FloatArray,
-    axis: FloatArray,
-    radius: float,
-    tensor: FloatArray,
-    sigma: float,
+    points: FloatArray, centre: FloatArray, axis: FloatArray, radius: float, tensor: FloatArray, sigma: float
 ) -> FloatArray:
     """Covariance (3, 3) [m2] of the noise in the section: the squared residuals as n . M . n over the normals n."""
     u, v = basis(axis)
@@ -159,8 +137,6 @@ def _noise_tensor(
     plane = np.stack([u, v]) @ tensor @ np.stack([u, v]).T
     cosine, sine, distance = _feet(x, y, radius, plane[0, 0], plane[0, 1], plane[1, 1])
     near = np.abs(distance) < _CUT * sigma
-    if len(normals):
-        near &= _gate(offset - (offset @ axis)[:, None] * axis, normals, signed) > 0
     if near.sum() < 50:
         return sigma**2 * np.eye(3)
     x, y, square = cosine[near], sine[near], distance[near] ** 2
@@ -269,8 +245,6 @@ def _feet(
 @njit(cache=True, nogil=True)
 def _iterate(
     points: FloatArray,
-    normals: FloatArray,
-    signed: bool,
     centre: FloatArray,
     axis: FloatArray,
     radius: float,
@@ -280,7 +254,6 @@ def _iterate(
     metric: bool,
 ) -> tuple[bool, FloatArray, FloatArray, float]:
     centre, axis = centre.copy(), axis.copy()
-    gated = len(normals) > 0
     count = len(points)
     used = 5 if free_radius else 4
     row = np.empty(5)
@@ -320,15 +293,6 @@ def _iterate(
                 continue
             z = ox * axis[0] + oy * axis[1] + oz * axis[2]
             weight = (1.0 - share) ** 2 * typical / variance
-            gate = 1.0
-            if gated:
-                nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-                if nx != 0.0 or ny != 0.0 or nz != 0.0:
-                    cosine = x * (nx * u[0] + ny * u[1] + nz * u[2]) + y * (nx * v[0] + ny * v[1] + nz * v[2])
-                    if not signed:
-                        cosine = abs(cosine)
-                    gate = min(max((cosine - 0.6) / 0.3, 0.0), 1.0)
-                    weight *= gate
             moment += weight * z
             total += weight
             z -= lever
@@ -341,7 +305,7 @@ def _iterate(
                 # Isotropic unit noise about a curve of curvature k lies k / 2 outside it; here in the tensor's metric.
                 bias = 0.5 * determinant / (radius * variance)
                 for a in range(used):
-                    right[a] += gate * _SLOPE * typical / variance * bias * row[a]
+                    right[a] += _SLOPE * typical / variance * bias * row[a]
         if total < 5.0:
             return False, centre, axis, radius
         for a in range(used):

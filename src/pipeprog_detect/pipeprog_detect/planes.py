@@ -143,7 +143,7 @@ def _turned(ellipse: Ellipse, plane: CuttingPlane) -> list[Cylinder]:
 
 def _straightened(points: FloatArray, turned: Sequence[Cylinder], sigma: float) -> list[Cylinder]:
     """The cylinders again, each fitted to the points (N, 3) of the slab as what they are: a short piece of a pipe."""
-    fits = [fit_cylinder(points, None, start, sigma, along_ray=False) for start in turned]
+    fits = [fit_cylinder(points, start, sigma, along_ray=False) for start in turned]
     return [fit.cylinder for fit in fits if fit is not None]
 
 

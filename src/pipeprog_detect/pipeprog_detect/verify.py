@@ -92,7 +92,7 @@ def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma
             cylinder = _cut(cylinder, low, high)
             points = _within(points, cylinder, Run(0.0, cylinder.length))
         facing = _spread_out(_facing(points, cylinder, hypothesis.sector), _FIT_POINTS)
-        fit = fit_cylinder(facing, None, cylinder, wide, reach=reach, along_ray=False)
+        fit = fit_cylinder(facing, cylinder, wide, reach=reach, along_ray=False)
         if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
             return None
         wide = float(np.clip(1.2 * fit.rmse, 0.7 * sigma + 3e-4, 1.6 * sigma + 7e-4))
@@ -116,7 +116,7 @@ def settle(
     near = points[np.abs(_signed_distance(points, cylinder)) < max(5.0 * wide, 0.2 * cylinder.radius)]
     # A cap closes the end: its points lie within the barrel all around, and would draw the radius in.
     body = _facing(_within(near, cylinder, _without_caps(cylinder, wide)), cylinder, sector)
-    fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), None, cylinder, wide, reach=1.0)
+    fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), cylinder, wide, reach=1.0)
     if fit is None:
         return None
     # What the residuals do not show: third orders of the noise, and a bend of the cloud that is alike all along.
@@ -152,7 +152,7 @@ def thin_start(
         for angle in np.arange(8) * (np.pi / 4):
             shift = 0.6 * radius * (np.cos(angle) * u + np.sin(angle) * v)
             initial = Cylinder(line.start + shift, line.end + shift, radius)
-            fit = fit_cylinder(points, None, initial, sigma, reach=1.0, along_ray=False)
+            fit = fit_cylinder(points, initial, sigma, reach=1.0, along_ray=False)
             if fit is None or not 0.5 * min(radii) < fit.cylinder.radius < 1.5 * max(radii):
                 continue
             share = np.clip(1.0 - (_signed_distance(points, fit.cylinder) / (4.0 * sigma)) ** 2, 0.0, None)
@@ -197,7 +197,7 @@ def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: fl
     square = max(float(values[2]) - noise**2, 0.25 * float(values[2]))
     radius = float(np.sqrt(square / 0.355))
     again = fit_cylinder(
-        _spread_out(points, _FINAL_POINTS), None, replace(cylinder, radius=radius), wide, reach=1.0, fixed_radius=radius
+        _spread_out(points, _FINAL_POINTS), replace(cylinder, radius=radius), wide, reach=1.0, fixed_radius=radius
     )
     # The share of the noise across is known to a third of it; a part hidden takes up to a fifth off the width.
     sigma = float(np.hypot(0.1 * radius, 1.5 * 0.5 * noise**2 / radius))
