@@ -43,13 +43,14 @@ class CylinderFit:
         return float(np.sqrt(self.covariance[4, 4]))
 
 
+@njit(cache=True, nogil=True)
 def basis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors (3,) that complete the unit vector axis (3,) to a right-handed frame."""
-    least = np.zeros(3)
-    least[int(np.argmin(np.abs(axis)))] = 1.0
-    u = np.asarray(np.cross(axis, least), np.float64)
-    u /= np.linalg.norm(u)
-    return u, np.asarray(np.cross(axis, u), np.float64)
+    helper = np.zeros(3)
+    helper[np.argmin(np.abs(axis))] = 1.0
+    across = np.cross(axis, helper)
+    u = across / np.sqrt(across @ across)
+    return u, np.cross(axis, u)
 
 
 def fit_cylinder(
@@ -261,16 +262,7 @@ def _iterate(
     precision = 1e-3 * np.sqrt(tensor[0, 0] + tensor[1, 1] + tensor[2, 2])
     for turn in range(_MOST_ROUNDS):
         wide = max(1.0, reach + (1.0 - reach) * turn / (_ANNEALING - 1.0))
-        # A frame normal to the axis.
-        least = 0
-        for k in range(1, 3):
-            if abs(axis[k]) < abs(axis[least]):
-                least = k
-        helper = np.zeros(3)
-        helper[least] = 1.0
-        u = np.cross(axis, helper)
-        u /= np.sqrt(u @ u)
-        v = np.cross(axis, u)
+        u, v = basis(axis)
         muu, muv, mvv = u @ tensor @ u, u @ tensor @ v, v @ tensor @ v
         typical, determinant = 0.5 * (muu + mvv), muu * mvv - muv * muv
         matrix = np.zeros((5, 5))

@@ -260,15 +260,7 @@ def _worth(
 
     Of each sector the square root of its weight counts: an arc tells the radius, a dense patch does not.
     """
-    least = 0
-    for k in range(1, 3):
-        if abs(axis[k]) < abs(axis[least]):
-            least = k
-    helper = np.zeros(3)
-    helper[least] = 1.0
-    u = np.cross(axis, helper)
-    u /= np.sqrt(u @ u)
-    v = np.cross(axis, u)
+    u, v = basis(axis)
     sectors = np.zeros(_SECTORS)
     for i in range(len(points)):
         ox, oy, oz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
