@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeprog_detect import detector
+from pipeprog_detect import hypotheses
 from pipeprog_detect.bill import Bill, PipeClass
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -80,7 +80,7 @@ def test_pipes_of_a_growing_map_are_those_of_the_whole() -> None:
     cylinders = found(grown, memory)
     assert len(cylinders) == 3
     assert all(map(near, cylinders, (first, whole, last)))
-    with patch.object(detector.hypotheses, "votes_of", side_effect=AssertionError("nothing is new")):
+    with patch.object(hypotheses, "votes_of", side_effect=AssertionError("nothing is new")):
         again = found(grown, memory)
     assert all(near(one, other) for one, other in zip(again, cylinders, strict=True))
     gone = found(np.concatenate([wall(0, 2), whole_points, last_points]), memory)
