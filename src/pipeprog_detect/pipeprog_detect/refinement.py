@@ -19,6 +19,7 @@ from pipeprog_detect.outline import inside, viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.ribbons import DEPTH_SIGMA, covers, laid, mean_centre, propose
 from pipeprog_detect.runs import join, spanning
+from pipeprog_detect.support import MIN_SUPPORT, outline_support
 from pipeprog_detect.verify import Candidate, Evidence
 
 # Outlines of real pipes are supported along more than half of what is seen of them.
@@ -111,6 +112,8 @@ class Jury:
                 fit = self._of_planned_size(candidate, others)
                 if fit is None:
                     continue
+            if doubtful and fit is not None and not self._shows_both_outlines(fit.cylinder, others):
+                continue
             if not doubtful:
                 fit = self._as_planned(fit, others)
             if fit is None:
@@ -124,6 +127,10 @@ class Jury:
                 current[number] = measured.cylinder
                 found.append(measured)
         return found
+
+    def _shows_both_outlines(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
+        """Whether an edge of a board or a step is not taken for one outline of a pipe that has no other."""
+        return outline_support(cylinder, self._views, others).weaker_share >= MIN_SUPPORT
 
     def _as_planned(self, fit: ContourFit | None, others: Sequence[Cylinder]) -> ContourFit | None:
         """The fit, or one of a planned size near it whose outlines are about as well supported.

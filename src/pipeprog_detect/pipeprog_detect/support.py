@@ -34,9 +34,18 @@ class SupportProfile:
     @property
     def share(self) -> float:
         """Share of the outline, where three views or more see it, that has an edge in three and in most of them."""
-        judged = self.seen >= MIN_VIEWS
-        supported = judged & (self.hits >= MIN_VIEWS) & (self.hits >= MIN_SHARE * self.seen)
+        judged, supported = self._judged()
         return float(supported.sum() / judged.sum()) if judged.any() else 0.0
+
+    @property
+    def weaker_share(self) -> float:
+        """The same of the outline on that side that has less of it; of the only one where views see no other."""
+        judged, supported = (each.sum(axis=0) for each in self._judged())
+        return float((supported[judged > 0] / judged[judged > 0]).min()) if judged.any() else 0.0
+
+    def _judged(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        judged = self.seen >= MIN_VIEWS
+        return judged, judged & (self.hits >= MIN_VIEWS) & (self.hits >= MIN_SHARE * self.seen)
 
 
 def hits(at: Stations, edges: LimbEdges, view_offset: FloatArray) -> NDArray[np.bool_]:
@@ -55,12 +64,19 @@ def support_profile(at: Stations, hit: NDArray[np.bool_]) -> SupportProfile:
     return SupportProfile(along, np.asarray(seen, float), np.asarray(found, float))
 
 
-def support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], chunk: int = 12) -> float:
-    """Share (0 to 1) of the cylinder's predicted outline with a supporting edge in at least three and most views."""
+def outline_support(
+    cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], chunk: int = 12
+) -> SupportProfile:
+    """Support of a cylinder's predicted outlines by the edges near them."""
     basis = frame(cylinder, viewing_direction(cylinder, views))
     none = np.zeros(len(views))
     at, edges = outline_edges(cylinder, views, others, basis, none, 1.5, SHARP, chunk)
-    return support_profile(at, hits(at, edges, none)).share if len(at) else 0.0
+    return support_profile(at, hits(at, edges, none))
+
+
+def support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> float:
+    """Share (0 to 1) of the cylinder's predicted outline with a supporting edge in at least three and most views."""
+    return outline_support(cylinder, views, others).share
 
 
 def own_outlines(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeprog_detect.outline import camera_centre
 from pipeprog_detect.pipe import Cylinder, View
-from pipeprog_detect.support import MIN_SUPPORT, own_outlines, support
+from pipeprog_detect.support import MIN_SUPPORT, outline_support, own_outlines, support
 
 BEHIND = 0.012  # [m]
 PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)  # as in pipe_views
@@ -32,3 +32,12 @@ def test_a_pipe_alone_keeps_its_outlines_and_what_never_had_any_is_not_judged_by
     nothing = Cylinder(PIPE.start + aside, PIPE.end + aside, PIPE.radius)
     assert support(nothing, pipe_views, []) < MIN_SUPPORT
     assert own_outlines([PIPE, nothing], pipe_views).tolist() == [True, True]
+
+
+def test_an_edge_that_is_one_outline_of_a_cylinder_is_not_both(pipe_views: list[View]) -> None:
+    aside = np.array([1.5 * PIPE.radius, 0.0, 0.0])
+    beside = Cylinder(PIPE.start + aside, PIPE.end + aside, 0.5 * PIPE.radius)
+    seen = outline_support(beside, pipe_views, [])
+    assert seen.share > 2.0 * MIN_SUPPORT
+    assert seen.weaker_share < MIN_SUPPORT
+    assert outline_support(PIPE, pipe_views, []).weaker_share > 0.8
