@@ -42,12 +42,13 @@ LINE_DEPTH_SIGMA = 0.03
 NEARLY_PARALLEL, PARALLEL_SIGMA, LEAST_PARALLEL = np.radians(5.0), np.radians(0.3), 3
 # The axes of pipes side by side are so many radii apart.
 TOUCHING = 2.0
-# Shorter than so many radii a pair of lines may be a hanger, a clamp, or chance.
+# Shorter than so many radii what the cloud does not resolve may be a hanger, a clamp, or chance.
 SLENDER = 20.0
 # A strip's edges stay where they are, a cylinder's outlines do not: halfway between, by so many standard deviations.
 FLAT, SURELY = 0.5, 2.0
-# The cloud resolves a section of five times its noise, seen along a third of the way around.
-RESOLVED_RADII, RESOLVED_ARC = 5.0, np.radians(120.0)
+# The cloud resolves a section of five times its noise, seen along a third of the way around, whose radius it knows to a
+# twentieth: the edge of a box is round, too, to a cloud.
+RESOLVED_RADII, RESOLVED_ARC, RESOLVED_SIGMA = 5.0, np.radians(120.0), 0.05
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ class Jury:
                 if fit is None:
                     continue
             if doubtful and fit is not None and not self._shows_both_outlines(fit.cylinder, others):
+                continue
+            if doubtful and candidate.blurred and fit is not None and _is_stub(fit.cylinder):
                 continue
             if not doubtful:
                 fit = self._as_planned(fit, others)
@@ -187,7 +190,7 @@ class Jury:
             fit = self._by_lines(proposed, known, thin, follow=False)
             if fit is not None:
                 fit = self._followed(fit, proposed.radius, points, known, thin)
-            if fit is None or fit.cylinder.length < SLENDER * fit.cylinder.radius or _is_known(fit.cylinder, known):
+            if fit is None or _is_stub(fit.cylinder) or _is_known(fit.cylinder, known):
                 continue
             lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma, fit.rims))
             known.append(fit.cylinder)
@@ -255,7 +258,7 @@ class Jury:
         known, fit = self._memory.recall(cylinder, follow, others, views)
         if known:
             return fit
-        seen = SeenArc(candidate.evidence.arc, sigma) if trusted else None
+        seen = SeenArc(candidate.evidence.arc, sigma) if trusted and not candidate.blurred else None
         starts = [cylinder.radius]
         if candidate.blurred:  # the cloud does not know the radius: the planned ones within its reach are tried, too
             starts += [radius for radius in planned_radii if abs(radius - cylinder.radius) < 3.0 * sigma]
@@ -298,6 +301,10 @@ def few_showing(cylinder: Cylinder, views: Sequence[View]) -> list[View]:
     places = cylinder.start + np.linspace(0.0, 1.0, 9)[:, None] * (cylinder.end - cylinder.start)
     showing = [view for view in views if inside(view, places).any()]
     return showing[:: -(-len(showing) // FEW_VIEWS)] if showing else []
+
+
+def _is_stub(cylinder: Cylinder) -> bool:
+    return cylinder.length < SLENDER * cylinder.radius
 
 
 def _is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
@@ -382,5 +389,6 @@ def _cut(line: Cylinder, ends: Cylinder) -> Cylinder:
 
 
 def _resolved(candidate: Candidate) -> bool:
-    evidence = candidate.evidence
-    return candidate.cylinder.radius > RESOLVED_RADII * evidence.noise and evidence.arc > RESOLVED_ARC
+    evidence, radius = candidate.evidence, candidate.cylinder.radius
+    known = candidate.radius_sigma < RESOLVED_SIGMA * radius
+    return known and radius > RESOLVED_RADII * evidence.noise and evidence.arc > RESOLVED_ARC

@@ -24,6 +24,8 @@ _CORNER = float(np.cos(np.radians(30.0)))
 _STEP, _BESIDE, _LEAST_BESIDE = 0.05, 3.0, 0.03
 # ... aslant up to so many times as far before and behind it; so many points tell where one is.
 _ASLANT, _LEAST_POINTS = 3.0, 3
+# A cylinder whose axis lies behind the wall, or before it by less than this share of the radius, is in it.
+_IN_WALL = 0.5
 # Walls are flat to so much [m] over that.
 _WAVINESS = 1e-3
 
@@ -78,7 +80,8 @@ class Surroundings:
         """Whether more than half of the cylinder, looked at along `towards` (3,), would lie within walls.
 
         The outlines are seen where the view touches the cylinder, beside its axis and hardly nearer than that: a wall
-        that shows its own face nearer than the axis on both sides would hide both of them.
+        that shows its own face nearer than the axis on both sides would hide both of them. What the view says of the
+        depth may be off by some of the radius, and a pipe on a wall has its axis a whole radius before it.
         """
         sideways, depth = frame(cylinder, towards)
         reach = cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE)
@@ -88,11 +91,12 @@ class Surroundings:
         bins = max(int(cylinder.length / _STEP), 4)
         place = np.clip((offset @ cylinder.axis / cylinder.length * bins).astype(np.int64), 0, bins - 1)
         clear = 3.0 * float(np.hypot(self.sigma, radius_sigma)) + _WAVINESS
+        surface = _IN_WALL * cylinder.radius - clear
         buried = 0
         for step in range(bins):
             beside = (place == step) & (np.abs(aside) > cylinder.radius) & (np.abs(aside) < reach)
             flanks = [behind[beside & (side * aside > 0)] for side in (-1.0, 1.0)]
-            buried += all(len(flank) >= _LEAST_POINTS and np.median(flank) < -clear for flank in flanks)
+            buried += all(len(flank) >= _LEAST_POINTS and np.median(flank) < surface for flank in flanks)
         return buried > 0.5 * bins
 
     def _surface(self, candidate: Candidate) -> tuple[IntArray, FloatArray]:

@@ -47,7 +47,12 @@ def test_a_pipe_whose_axis_lies_behind_the_wall_is_buried() -> None:
 
 
 def test_a_radius_that_is_not_known_may_have_led_the_axis_behind_the_wall() -> None:
-    assert not surroundings(BACK).bury(upright(0.0, 0.006), 3e-3, AWAY)
+    assert not surroundings(BACK).bury(upright(0.0, 0.006), 4e-3, AWAY)
+
+
+def test_a_pipe_half_in_the_wall_is_buried_and_one_on_it_is_not() -> None:
+    assert surroundings(BACK).bury(upright(0.0, 0.0), 1e-4, AWAY)
+    assert not surroundings(BACK).bury(upright(0.0, -RADIUS), 1e-4, AWAY)
 
 
 def test_the_line_where_two_walls_meet_is_buried_and_a_pipe_before_it_is_not() -> None:
