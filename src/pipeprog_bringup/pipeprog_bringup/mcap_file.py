@@ -127,6 +127,7 @@ class McapFile:
     def _walk(self, stream: BinaryIO, size: int) -> None:
         """Find blocks and channels up to the footer, or up to the tear."""
         position, data_section = len(MAGIC), True
+        summary: list[tuple[int, bytes]] = []
         while True:
             stream.seek(position)
             head = stream.read(9)
@@ -142,10 +143,16 @@ class McapFile:
                 return
             if opcode == FOOTER:
                 stream.seek(end)
-                self.torn_at = None if stream.read(len(MAGIC)) == MAGIC else end
+                if stream.read(len(MAGIC)) != MAGIC:
+                    self.torn_at = end
+                    return
+                for record in summary:
+                    self._register(*record)
                 return
-            if opcode in (SCHEMA, CHANNEL):
+            if opcode in (SCHEMA, CHANNEL) and data_section:
                 self._register(opcode, stream.read(length))
+            elif opcode in (SCHEMA, CHANNEL):  # of a file that ends well: a tear may run through its summary
+                summary.append((opcode, stream.read(length)))
             elif opcode == MESSAGE and data_section and length >= 22:
                 channel_id, _, log_time = struct.unpack("<HIQ", stream.read(14))
                 counts = Counter({channel_id: 1})
