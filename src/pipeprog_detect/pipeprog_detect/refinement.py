@@ -113,9 +113,7 @@ class Jury:
                 fit = self._of_planned_size(candidate, others)
                 if fit is None:
                     continue
-            if doubtful and fit is not None and not self._shows_both_outlines(fit.cylinder, others):
-                continue
-            if doubtful and candidate.blurred and fit is not None and _is_stub(fit.cylinder):
+            if self.sits and candidate.blurred and fit is not None and not self._stands_alone(fit.cylinder, others):
                 continue
             if not doubtful:
                 fit = self._as_planned(fit, others)
@@ -131,8 +129,10 @@ class Jury:
                 found.append(measured)
         return found
 
-    def _shows_both_outlines(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
-        """Whether an edge of a board or a step is not taken for one outline of a pipe that has no other."""
+    def _stands_alone(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
+        """Whether the keyframes alone make a pipe of it: no stub, and no edge of a board or a step for one outline."""
+        if _is_stub(cylinder):
+            return False
         return outline_support(cylinder, self._views, others).weaker_share >= MIN_SUPPORT
 
     def _as_planned(self, fit: ContourFit | None, others: Sequence[Cylinder]) -> ContourFit | None:
