@@ -108,6 +108,7 @@ def serve(
             if isinstance(command, Finish):
                 reconstruction.move(command.motion)
                 connection.send(_finish(connection, reconstruction, command.colmap))
+                since_map = 0  # another map after the last one would have a stamp that no pipes have
                 continue
             connection.send(_answer(reconstruction, command))
             if isinstance(command, Keyframe):
