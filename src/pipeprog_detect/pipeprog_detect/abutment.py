@@ -10,7 +10,7 @@ from pipeprog_detect.background import Plane
 from pipeprog_detect.edges import SHARP
 from pipeprog_detect.growth import outline_evidence
 from pipeprog_detect.octree import Octree
-from pipeprog_detect.outline import camera_centre, inside
+from pipeprog_detect.outline import camera_centre, showing
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 
 # An axis meets a plane at more than 30 deg, or it rather runs along it.
@@ -96,8 +96,7 @@ def _goes_on(
 ) -> bool:
     """Whether it is more probable that the pipe goes on for `ahead` [m] than that it ends within that."""
     end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
-    looking = [view for view in views if inside(view, end + np.linspace(0.0, 1.0, 5)[:, None] * ahead * out).any()]
-    looking = looking[:: -(-len(looking) // ENOUGH_VIEWS)] if looking else []
+    looking = showing(end + np.linspace(0.0, 1.0, 5)[:, None] * ahead * out, views, ENOUGH_VIEWS)
     total: FloatArray = np.zeros(1)
     place: FloatArray = np.zeros(1)
     if looking:

@@ -112,6 +112,12 @@ def inside(view: View, points: FloatArray) -> NDArray[np.bool_]:
     return np.asarray((depth > 0.05) & (pixel > 0).all(axis=1) & (pixel < size - 1).all(axis=1))
 
 
+def showing(points: FloatArray, views: Sequence[View], most: int) -> list[View]:
+    """Views, spread evenly and no more than `most`, of those that show some of the points (N, 3) of the map."""
+    able = [view for view in views if inside(view, points).any()]
+    return able[:: -(-len(able) // most)] if able else []
+
+
 def stations(
     cylinder: Cylinder, views: Sequence[View], basis: FloatArray, spacing: float, margin: float = 4.0
 ) -> Stations:

@@ -15,7 +15,7 @@ from pipeprog_detect.contour import ContourFit, refine
 from pipeprog_detect.extent import Run
 from pipeprog_detect.lone_limb import SeenArc
 from pipeprog_detect.memory import Memory
-from pipeprog_detect.outline import inside, viewing_direction
+from pipeprog_detect.outline import showing, viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.ribbons import DEPTH_SIGMA, covers, laid, mean_centre, propose
 from pipeprog_detect.runs import join, spanning
@@ -84,7 +84,7 @@ class Jury:
         """
         if any(_alike(candidate.cylinder, refused) for refused in self._refused):
             return False
-        views = few_showing(candidate.cylinder, self._views)
+        views = showing(_places(candidate.cylinder), self._views, FEW_VIEWS)
         fit = self._as_planned(self._refined(candidate, [], views, follow=False), [])
         if fit is None or fit.support < CONVINCING or not self._is_planned(fit):
             self._refused.append(candidate.cylinder)
@@ -296,11 +296,9 @@ def joined(measured: Sequence[Measured]) -> list[Measured]:
     return whole
 
 
-def few_showing(cylinder: Cylinder, views: Sequence[View]) -> list[View]:
-    """Views, spread evenly over those that show some of the cylinder."""
-    places = cylinder.start + np.linspace(0.0, 1.0, 9)[:, None] * (cylinder.end - cylinder.start)
-    showing = [view for view in views if inside(view, places).any()]
-    return showing[:: -(-len(showing) // FEW_VIEWS)] if showing else []
+def _places(cylinder: Cylinder) -> FloatArray:
+    """Points (9, 3) along the axis."""
+    return cylinder.start + np.linspace(0.0, 1.0, 9)[:, None] * (cylinder.end - cylinder.start)
 
 
 def _is_stub(cylinder: Cylinder) -> bool:

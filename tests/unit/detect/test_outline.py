@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.outline import frame, moved, outline, project, stations, viewing_direction, visible
+from pipeprog_detect.outline import frame, moved, outline, project, showing, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, View
 
 CAMERA = Camera(1280, 720, 914.0, 910.0, 640.2, 358.7)
@@ -89,3 +89,20 @@ def test_nearer_pipe_hides_what_lies_behind_it() -> None:
     # 0.04 m at 1.5 m covers 0.053 m at 2 m; the margin is 3 px of 2.2 mm.
     assert np.abs(hidden).max() == pytest.approx(0.053 + 0.0066, abs=0.006)
     assert seen[np.abs(at.along) > 0.07].all()
+
+
+def test_the_few_views_show_the_place_and_are_spread_over_those_that_do() -> None:
+    camera = Camera(480, 270, 345.0, 345.0, 239.5, 134.5)
+    along_y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    views = []
+    for number in range(200):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = along_y, -along_y @ np.array([0.05 * number, -1.2, 0.0])
+        views.append(View(number, np.zeros((270, 480), np.uint8), camera, pose))
+    place = np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    able = [view.stamp for view in views if 0.05 * view.stamp < 0.2 + 1.2 * 239.5 / 345.0]
+    few = [view.stamp for view in showing(place, views, 10)]
+    assert 5 <= len(few) <= 10
+    assert set(few) <= set(able)
+    assert few[-1] > able[-1] - 6
+    assert showing(place - 90.0, views, 10) == []

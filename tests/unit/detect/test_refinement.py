@@ -13,7 +13,7 @@ from pipeprog_detect.bill import Bill, PipeClass
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.extent import Run
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.refinement import FEW_VIEWS, Jury, Measured, aligned, few_showing, joined
+from pipeprog_detect.refinement import Jury, Measured, aligned, joined
 from pipeprog_detect.verify import Candidate, Evidence
 
 # The pipe of `pipe_views`.
@@ -46,17 +46,6 @@ def test_a_pipe_that_few_keyframes_of_many_show_is_vouched_for(pipe_views: list[
     candidate = Candidate(rough, 0.002, 900, [Run(0.0, rough.length)], evidence)
     assert Jury(views, BILL, ContourConfig()).vouches_for(candidate)
     assert not Jury(elsewhere, BILL, ContourConfig()).vouches_for(candidate)
-
-
-def test_the_few_views_show_the_pipe_and_are_spread_over_those_that_do() -> None:
-    views = [looking_along_y(0.05 * number, number) for number in range(200)]
-    pipe = level(0.4)
-    few = few_showing(pipe, views)
-    assert 0.5 * FEW_VIEWS <= len(few) <= FEW_VIEWS
-    showing = [view.stamp for view in views if 0.05 * view.stamp < 0.2 + 1.2 * 239.5 / 345.0]
-    assert {view.stamp for view in few} <= set(showing)
-    assert few[-1].stamp > showing[-1] - 3
-    assert few_showing(replace(pipe, start=pipe.start - 90.0, end=pipe.end - 90.0), views) == []
 
 
 @settings(max_examples=30, deadline=None)
