@@ -53,6 +53,11 @@ def classify(radius: float, sigma: float, bill: Bill, concave: bool = False) -> 
     return Verdict(bill.classes[best].name if probability >= SURE else None, probability)
 
 
+def is_planned(radius: float, sigma: float, bill: Bill) -> bool:
+    """Whether a pipe of `radius` +- `sigma` [m] may be of one of the bill's classes, or of one of several."""
+    return classify(radius, sigma, bill).probability > 0.0
+
+
 def by_kmeans(radii: Sequence[float], nominal: Sequence[float]) -> list[int]:
     """Number of the class of each pipe as the paper has it: k-means over radii [m] whose means start at the nominal.
 

@@ -13,12 +13,14 @@ from pipeprog_detect.abutment import abutted
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.inside import find_concave
+from pipeprog_detect.lost import find_lost
+from pipeprog_detect.measured import Measured, joined
 from pipeprog_detect.memory import Memory
 from pipeprog_detect.occlusion import with_depths
 from pipeprog_detect.outline import viewing_direction
 from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
 from pipeprog_detect.planes import parse_planes
-from pipeprog_detect.refinement import Jury, Measured, joined
+from pipeprog_detect.refinement import Jury
 from pipeprog_detect.search import THICKEST_LINE, Report, Search, is_pipe
 from pipeprog_detect.support import own_outlines
 from pipeprog_detect.surroundings import Surroundings
@@ -89,7 +91,9 @@ def detect(
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
     measured = _genuine(measured, around, judging)
     report(0.95, "looking for thin pipes in the keyframes")
-    measured += _genuine(jury.measure_lost(points, THICKEST_LINE, measured), around, judging)
+    edges = memory.edges if memory else {}
+    lost = find_lost(points, THICKEST_LINE, measured, judging, bill, config.contour, edges)
+    measured += _genuine(lost, around, judging)
     measured = _abutted(joined(measured), around, judging)
     report(1.0, "done")
     return _product(measured, bill, shift, config)

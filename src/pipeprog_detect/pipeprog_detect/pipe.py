@@ -53,6 +53,12 @@ class Cylinder:
         """Unit vector (3,) from start to end."""
         return (self.end - self.start) / self.length
 
+    def contains(self, point: FloatArray) -> bool:
+        """Whether a point (3,) lies within."""
+        along = float((point - self.start) @ self.axis)
+        off_axis = point - self.start - along * self.axis
+        return 0.0 < along < self.length and float(off_axis @ off_axis) < self.radius**2
+
 
 @dataclass(frozen=True)
 class Pipe:

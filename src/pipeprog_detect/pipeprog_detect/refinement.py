@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeprog_detect.bill import Bill
-from pipeprog_detect.classify import classify
+from pipeprog_detect.classify import is_planned
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import ContourFit, refine
-from pipeprog_detect.extent import Run
 from pipeprog_detect.lone_limb import SeenArc
+from pipeprog_detect.measured import Measured, is_known, is_stub
 from pipeprog_detect.memory import Memory
-from pipeprog_detect.outline import showing, viewing_direction
+from pipeprog_detect.outline import showing
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.ribbons import DEPTH_SIGMA, covers, laid, mean_centre, propose
-from pipeprog_detect.runs import join, spanning
 from pipeprog_detect.support import MIN_SUPPORT, outline_support
-from pipeprog_detect.verify import Candidate, Evidence
+from pipeprog_detect.verify import Candidate
 
 # Outlines of real pipes are supported along more than half of what is seen of them.
 CONVINCING = 0.5
@@ -32,36 +29,9 @@ FEW_VIEWS = 30
 NEAR_PLANNED, AS_GOOD = 0.15, 0.6
 # Cloud and outlines contradict each other where their radii differ by so many standard deviations, noise included.
 CONTRADICTION = 4.0
-# Lines are followed up for so many pipes at most, beside so many of the cloud's points.
-MOST_LOST, MOST_POINTS = 40, 600_000
-# Without points of the cloud the outlines must be the better seen.
-LINES_CONVINCING = 0.6
-# What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
-LINE_DEPTH_SIGMA = 0.03
-# Pipes that run within so much of one direction are laid parallel, to so much; two may be so by chance.
-NEARLY_PARALLEL, PARALLEL_SIGMA, LEAST_PARALLEL = np.radians(5.0), np.radians(0.3), 3
-# The axes of pipes side by side are so many radii apart.
-TOUCHING = 2.0
-# Shorter than so many radii what the cloud does not resolve may be a hanger, a clamp, or chance.
-SLENDER = 20.0
-# A strip's edges stay where they are, a cylinder's outlines do not: halfway between, by so many standard deviations.
-FLAT, SURELY = 0.5, 2.0
 # The cloud resolves a section of five times its noise, seen along a third of the way around, whose radius it knows to a
 # twentieth: the edge of a box is round, too, to a cloud.
 RESOLVED_RADII, RESOLVED_ARC, RESOLVED_SIGMA = 5.0, np.radians(120.0), 0.05
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A candidate after the images were asked: its cylinder and the standard deviation of its radius [m].
-
-    `rims`: what the images say for a rim at its start and at its end (`rim.End.odds`).
-    """
-
-    candidate: Candidate
-    cylinder: Cylinder
-    radius_sigma: float
-    rims: tuple[float, float] = (0.0, 0.0)
 
 
 class Jury:
@@ -86,7 +56,7 @@ class Jury:
             return False
         views = showing(_places(candidate.cylinder), self._views, FEW_VIEWS)
         fit = self._as_planned(self._refined(candidate, [], views, follow=False), [])
-        if fit is None or fit.support < CONVINCING or not self._is_planned(fit):
+        if fit is None or fit.support < CONVINCING or not is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill):
             self._refused.append(candidate.cylinder)
             return False
         return True
@@ -109,7 +79,7 @@ class Jury:
                 continue
             # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate or a corner.
             doubtful = self.sits and (candidate.blurred or not trusted[number])
-            if doubtful and (fit is None or not self._is_planned(fit)):
+            if doubtful and (fit is None or not is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill)):
                 fit = self._of_planned_size(candidate, others)
                 if fit is None:
                     continue
@@ -119,19 +89,18 @@ class Jury:
                 fit = self._as_planned(fit, others)
             if fit is None:
                 measured = Measured(candidate, candidate.cylinder, candidate.radius_sigma)
-            elif not self._is_planned(fit) and _contradict(candidate, fit):
+            elif not is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill) and _contradict(candidate, fit):
                 measured = Measured(candidate, *_by_the_cloud(candidate, fit))
             else:
                 measured = Measured(candidate, fit.cylinder, fit.radius_sigma, fit.rims)
-            middle = 0.5 * (measured.cylinder.start + measured.cylinder.end)
-            if not any(_contains(known.cylinder, middle) for known in found):
+            if not is_known(measured.cylinder, [known.cylinder for known in found]):
                 current[number] = measured.cylinder
                 found.append(measured)
         return found
 
     def _stands_alone(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
         """Whether the keyframes alone make a pipe of it: no stub, and no edge of a board or a step for one outline."""
-        if _is_stub(cylinder):
+        if is_stub(cylinder):
             return False
         return outline_support(cylinder, self._views, others).weaker_share >= MIN_SUPPORT
 
@@ -141,7 +110,7 @@ class Jury:
         A shadow along a pipe passes for its outline where the cameras never rise or fall. Pipes of sizes that nobody
         planned are rarer than shadows, but where the planned size finds no outlines of its own the fit stands.
         """
-        if fit is None or self._is_planned(fit):
+        if fit is None or is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill):
             return fit
         radius = fit.cylinder.radius
         planned = [
@@ -151,7 +120,11 @@ class Jury:
             start = replace(fit.cylinder, radius=size)
             sigma = abs(size - radius)
             again = refine(start, sigma, self._views, others, self._config, (), known_radius=True, ends_known=True)
-            if again is not None and self._is_planned(again) and again.support > AS_GOOD * fit.support:
+            if (
+                again is not None
+                and is_planned(again.cylinder.radius, again.radius_sigma, self._bill)
+                and again.support > AS_GOOD * fit.support
+            ):
                 return again
         return fit
 
@@ -166,80 +139,13 @@ class Jury:
             if candidate.blurred and abs(one.outer_radius - candidate.cylinder.radius) < reach:
                 start = replace(candidate.cylinder, radius=one.outer_radius)
                 fit = refine(start, sigma, self._views, others, self._config, (), known_radius=True, ends_known=True)
-                if fit is not None and fit.support > CONVINCING and self._is_planned(fit):
+                if (
+                    fit is not None
+                    and fit.support > CONVINCING
+                    and is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill)
+                ):
                     fits.append(fit)
         return max(fits, key=lambda fit: fit.support, default=None)
-
-    def measure_lost(
-        self, points: NDArray[np.floating], thickest: float, found: Sequence[Measured]
-    ) -> tuple[Measured, ...]:
-        """Pipes up to `thickest` [m] of which the keyframes show lines and the cloud (N, 3) too little.
-
-        They must have a planned size and most of their outlines, and these must move against each other from view to
-        view as a cylinder's do, where the views differ enough to tell.
-        """
-        thin = [planned.outer_radius for planned in self._bill.classes if planned.outer_radius < thickest]
-        if not self.sits or not thin:
-            return ()
-        some = points[:: -(-len(points) // MOST_POINTS)].astype(np.float32)
-        known = [measured.cylinder for measured in found]
-        lost: list[Measured] = []
-        for proposed in propose(self._views, some, thin, known, MOST_LOST, self._memory.edges):
-            if _is_known(proposed, known) or self._is_rival(proposed, lost):
-                continue
-            fit = self._by_lines(proposed, known, thin, follow=False)
-            if fit is not None:
-                fit = self._followed(fit, proposed.radius, points, known, thin)
-            if fit is None or _is_stub(fit.cylinder) or _is_known(fit.cylinder, known):
-                continue
-            lost.append(Measured(_seen(fit, points), fit.cylinder, fit.radius_sigma, fit.rims))
-            known.append(fit.cylinder)
-        return tuple(lost)
-
-    def _is_rival(self, proposed: Cylinder, lost: Sequence[Measured]) -> bool:
-        """Whether the keyframes show it where they show one of the lost pipes: two cannot both be there."""
-        centre = mean_centre(proposed, self._views)
-        return centre is not None and any(covers(each.cylinder, proposed, centre, TOUCHING) for each in lost)
-
-    def _followed(
-        self,
-        piece: ContourFit,
-        radius: float,
-        points: NDArray[np.floating],
-        known: Sequence[Cylinder],
-        radii: Sequence[float],
-    ) -> ContourFit | None:
-        """The whole of a pipe of the given radius of which a piece was found by its lines.
-
-        Its depth, which lines seen from one height leave open, is that of the cloud's points (N, 3) before the wall.
-        """
-        slope_known_to = float(np.sqrt(piece.covariance[3, 3]))
-        start = replace(piece.cylinder, radius=radius)
-        start, slope_sigma = aligned(start, known, self._views, slope_known_to)
-        centre = mean_centre(start, self._views)
-        sloping = not np.isfinite(slope_sigma)
-        at_depth = None if centre is None else laid(start, points.astype(np.float32), centre, sloping)
-        depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * radius
-        return self._by_lines(at_depth or start, known, radii, depth_sigma, slope_sigma)
-
-    def _by_lines(
-        self,
-        proposed: Cylinder,
-        known: Sequence[Cylinder],
-        radii: Sequence[float],
-        depth_sigma: float = LINE_DEPTH_SIGMA,
-        slope_sigma: float = np.inf,
-        follow: bool = True,
-    ) -> ContourFit | None:
-        """The fit of a pipe proposed by its lines, where it has the outlines of one and a planned size."""
-        sigma, views = proposed.radius, self._views
-        fit = refine(proposed, sigma, views, known, self._config, radii, follow, True, depth_sigma, slope_sigma)
-        if fit is None or fit.support < LINES_CONVINCING or not self._is_planned(fit):
-            return None
-        return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
-
-    def _is_planned(self, fit: ContourFit) -> bool:
-        return classify(fit.cylinder.radius, fit.radius_sigma, self._bill).probability > 0.0
 
     def _refined(
         self,
@@ -279,80 +185,9 @@ class Jury:
         return best
 
 
-def joined(measured: Sequence[Measured]) -> list[Measured]:
-    """Pieces of one pipe made one, as thick as the best measured: the cloud may show one, lines another."""
-    whole = []
-    for pieces in join([each.cylinder for each in measured]):
-        best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
-        cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
-        points = sum(measured[piece].candidate.points for piece in pieces)
-        along = sorted(
-            (float(end @ cylinder.axis), rim)
-            for piece in (measured[number] for number in pieces)
-            for end, rim in zip((piece.cylinder.start, piece.cylinder.end), piece.rims, strict=True)
-        )
-        candidate, rims = replace(measured[best].candidate, points=points), (along[0][1], along[-1][1])
-        whole.append(Measured(candidate, cylinder, measured[best].radius_sigma, rims))
-    return whole
-
-
 def _places(cylinder: Cylinder) -> FloatArray:
     """Points (9, 3) along the axis."""
     return cylinder.start + np.linspace(0.0, 1.0, 9)[:, None] * (cylinder.end - cylinder.start)
-
-
-def _is_stub(cylinder: Cylinder) -> bool:
-    return cylinder.length < SLENDER * cylinder.radius
-
-
-def _is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
-    """Whether the middle of the cylinder lies within a known one."""
-    return any(_contains(other, 0.5 * (cylinder.start + cylinder.end)) for other in known)
-
-
-def aligned(
-    proposed: Cylinder, known: Sequence[Cylinder], views: Sequence[View], slope_known_to: float
-) -> tuple[Cylinder, float]:
-    """The cylinder as parallel to the known ones of nearly its direction as its image allows, and how sure [rad].
-
-    Seen from one height alone, a level pipe may as well slope towards the cameras: what else runs there tells, as far
-    as it differs by no more than the cylinder's own slope may be wrong, `slope_known_to` [rad].
-    """
-    middle = 0.5 * (proposed.start + proposed.end)
-    across = np.cross(proposed.axis, viewing_direction(proposed, views))
-    across = across / np.linalg.norm(across)
-    towards = np.cross(across, proposed.axis)
-    axes = np.array([other.axis * np.sign(other.axis @ proposed.axis) for other in known]).reshape(-1, 3)
-    steepest = max(np.tan(NEARLY_PARALLEL), 3.0 * slope_known_to)
-    slope = np.abs(axes @ towards) / (axes @ proposed.axis)
-    axes = axes[(np.abs(axes @ across) < np.sin(NEARLY_PARALLEL)) & (slope < steepest)]
-    if len(axes) < LEAST_PARALLEL:
-        return proposed, np.inf
-    direction = np.median(axes, axis=0)
-    spread = float(np.median(np.linalg.norm(axes - direction, axis=1)))
-    direction = direction - (direction @ across) * across
-    half = 0.5 * proposed.length * direction / np.linalg.norm(direction)
-    return Cylinder(middle - half, middle + half, proposed.radius), max(spread, PARALLEL_SIGMA)
-
-
-def _seen(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:
-    """The candidate that stands for a pipe found by its lines, with what the cloud (N, 3) holds of it."""
-    cylinder = fit.cylinder
-    offset = points - cylinder.start
-    along = offset @ cylinder.axis
-    near = (along > 0) & (along < cylinder.length)
-    offset, along = offset[near], along[near]
-    distance = np.linalg.norm(offset - along[:, None] * cylinder.axis, axis=1) - cylinder.radius
-    distance = distance[np.abs(distance) < cylinder.radius]
-    noise = float(np.sqrt(np.mean(distance**2))) if len(distance) else cylinder.radius
-    evidence = Evidence(np.pi, fit.support, 0.0, noise, 0.0, 1.0)
-    return Candidate(cylinder, fit.radius_sigma, len(distance), [Run(0.0, cylinder.length)], evidence)
-
-
-def _contains(cylinder: Cylinder, point: FloatArray) -> bool:
-    along = float((point - cylinder.start) @ cylinder.axis)
-    off_axis = point - cylinder.start - along * cylinder.axis
-    return 0.0 < along < cylinder.length and float(off_axis @ off_axis) < cylinder.radius**2
 
 
 def _alike(one: Cylinder, other: Cylinder) -> bool:
