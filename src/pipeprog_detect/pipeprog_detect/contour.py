@@ -44,8 +44,10 @@ MIN_STATIONS = 20
 # A pipe of which a piece is known is followed so many times, each time as far again.
 MAX_GROWTH = 6
 # Where more of it has so much less support, or another radius by so many standard deviations, what was known before
-# gives radius and axis.
+# gives radius and axis; as where its axis moves by more than once in a thousand times (chi square of four degrees of
+# freedom), and by more radii than that: a pipe beside it has lent its outlines.
 WORSE, SAME_RADIUS = 0.9, 3.0
+SAME_AXIS, ASIDE = 18.5, 0.5
 # ... and where it has less than half, it was something else.
 LOST = 0.5
 
@@ -144,7 +146,8 @@ def refine(
         changed = abs(again.cylinder.radius - refined.cylinder.radius)
         sigma = np.sqrt(refined.solution.covariance[4, 4] + (MODEL_ERROR / np.median(refined.at.gain)) ** 2)
         # There may be more of it that is of less use to measure it by.
-        if again.share < WORSE * refined.share or changed > SAME_RADIUS * sigma:
+        strays = _strays(again.cylinder, refined, basis)
+        if again.share < WORSE * refined.share or changed > SAME_RADIUS * sigma or strays:
             refined = replace(refined, cylinder=longer)
             continue
         refined, basis = again, turned
@@ -173,6 +176,17 @@ class _Refined:
     share: float
     at: Stations
     edges: LimbEdges
+
+
+def _strays(longer: Cylinder, known: _Refined, basis: FloatArray) -> bool:
+    """Whether the axis of a longer cylinder leaves the ends of the known one, whose step's frame is `basis` (2, 3)."""
+    ends = np.stack([known.cylinder.start, known.cylinder.end]) - longer.start
+    aside = (np.outer(ends @ longer.axis, longer.axis) - ends) @ basis.T
+    offset = aside.ravel()
+    systematic = MODEL_ERROR / float(np.median(known.at.gain))
+    covariance = known.solution.covariance[:4, :4] + systematic**2 * np.eye(4)
+    surely = float(offset @ np.linalg.solve(covariance, offset)) > SAME_AXIS
+    return surely and float(np.linalg.norm(aside, axis=1).max()) > ASIDE * known.cylinder.radius
 
 
 def _fine(

@@ -17,11 +17,13 @@ from pipeprog_detect.measured import Measured, is_known, is_stub
 from pipeprog_detect.outline import viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.ribbons import DEPTH_SIGMA, covers, laid, mean_centre, propose
+from pipeprog_detect.support import outline_support
 from pipeprog_detect.verify import Candidate, Evidence
 
 # Lines are followed up for so many pipes at most, beside so many of the cloud's points.
 MOST_LOST, MOST_POINTS = 40, 600_000
-# Without points of the cloud the outlines must be the better seen.
+# Without points of the cloud the outlines must be the better seen, and each of the two for itself at least half as
+# well: the edge of a duct, whose faces differ in brightness, is one outline, with texture for the other.
 LINES_CONVINCING = 0.6
 # What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
@@ -109,6 +111,8 @@ class _Lines:
         if fit is None or fit.support < LINES_CONVINCING:
             return None
         if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.bill):
+            return None
+        if outline_support(fit.cylinder, self.views, known).weaker_share < 0.5 * LINES_CONVINCING:
             return None
         return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from pipeprog_detect.outline import camera_centre
-from pipeprog_detect.pipe import Cylinder, View
-from pipeprog_detect.support import MIN_SUPPORT, outline_support, own_outlines, support
+from pipeprog_detect.pipe import Cylinder, FloatArray, View
+from pipeprog_detect.support import MIN_SUPPORT, SupportProfile, outline_support, own_outlines, support
 
 BEHIND = 0.012  # [m]
 PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)  # as in pipe_views
@@ -41,3 +42,22 @@ def test_an_edge_that_is_one_outline_of_a_cylinder_is_not_both(pipe_views: list[
     assert seen.share > 2.0 * MIN_SUPPORT
     assert seen.weaker_share < MIN_SUPPORT
     assert outline_support(PIPE, pipe_views, []).weaker_share > 0.8
+
+
+@pytest.mark.parametrize("views", [3, 4, 5, 8, 20])
+def test_few_views_of_a_real_outline_count_as_well_as_many(views: int) -> None:
+    """Edges that are found at chance in each view: 7 of 10 on a pipe, 1 of 4 on what is none."""
+    random = np.random.default_rng(views)
+    seen = np.full((4000, 2), float(views))
+    along: FloatArray = np.linspace(-1.0, 1.0, len(seen)).astype(np.float64)
+    pipe = SupportProfile(along, seen, random.binomial(views, 0.7, seen.shape).astype(float))
+    texture = SupportProfile(along, seen, random.binomial(views, 0.2, seen.shape).astype(float))
+    assert pipe.share == pytest.approx(1.0, abs=0.05)
+    assert pipe.weaker_share == pytest.approx(1.0, abs=0.07)
+    assert texture.share < MIN_SUPPORT
+
+
+def test_two_views_support_nothing() -> None:
+    seen = np.full((50, 2), 2.0)
+    along: FloatArray = np.arange(50.0).astype(np.float64)
+    assert SupportProfile(along, seen, seen).share == 0.0
