@@ -22,9 +22,9 @@ MIN_VIEWS, MIN_SHARE = 3, 0.5
 # Contrast and texture leave a view an edge at so much of a real outline (hit rate at the pipes of a generated field,
 # median; beside them 0.09). Of three views all must show it, which happens at a third of the places only.
 HIT_RATE = 0.7
-# Nine in ten of the pipes of a generated field reach 0.55, nine in ten cylinders beside them that are not there 0.1: the
-# geometric mean, since what was fitted to clutter finds more of it. The stated sigma of a radius grows where little is
-# seen.
+# Nine in ten of the pipes of a generated field reach 0.55, nine in ten cylinders beside them that are not there stay
+# under 0.1: the geometric mean, since what was fitted to clutter finds more of it. The stated sigma of a radius grows
+# where little is seen.
 MIN_SUPPORT = 0.25
 
 
