@@ -19,7 +19,7 @@ from pipeprog_detect.edges import (
     sideways,
 )
 from pipeprog_detect.growth import LEAST, grown
-from pipeprog_detect.lone_limb import SeenArc, lone_limb, precision
+from pipeprog_detect.lone_limb import SeenArc, lone_limb, precision, shows_both
 from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.rim import End, find_end
@@ -234,7 +234,7 @@ def _vote(
     sigma, known_radius, depth_sigma = expected
     at = stations(cylinder, views, basis, CHUNK)
     at = at.select(visible(cylinder, others, views, at))
-    if len(np.unique(at.view)) < 2 or len(np.unique(at.side)) < 2:
+    if len(np.unique(at.view)) < 2 or not shows_both(at):
         return np.zeros((0, 5))
     at = at.select(np.arange(0, len(at), max(len(at) // 1500, 1)))
     pixel = 1.0 / float(np.median(at.gain))

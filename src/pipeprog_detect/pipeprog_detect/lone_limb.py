@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeprog_detect.outline import stations, visible
+from pipeprog_detect.outline import Stations, stations, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 
 # An edge of texture agrees with an outline by chance in two views.
 MIN_VIEWS = 3
+# Places of one outline so few beside those of the other are gaps in what hides it.
+GAPS = 0.1
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,18 @@ class SeenArc:
 def lone_limb(
     cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], basis: FloatArray, spacing: float
 ) -> float | None:
-    """Where the only outline lies that any view shows beside the `others`: -1 or 1 along `basis[0]`; else None."""
+    """Where the only outline lies that the views show beside the `others`: -1 or 1 along `basis[0]`; else None."""
     at = stations(cylinder, views, basis, spacing)
     at = at.select(visible(cylinder, others, views, at))
-    if len(np.unique(at.side)) != 1 or len(np.unique(at.view)) < MIN_VIEWS:
+    if shows_both(at) or len(np.unique(at.view)) < MIN_VIEWS:
         return None
     return float(np.sign(at.jacobian[:, 0].sum()))
+
+
+def shows_both(at: Stations) -> bool:
+    """Whether visible stations lie on both outlines, more of them than gaps in what hides one let through."""
+    count = np.bincount(at.side, minlength=2)
+    return bool(count.min() > GAPS * count.max())
 
 
 def precision(seen: SeenArc, limb: float) -> FloatArray:

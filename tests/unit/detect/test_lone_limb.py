@@ -26,6 +26,19 @@ def test_the_outline_away_from_the_neighbour_is_the_only_one(pipe_views: list[Vi
     assert lone_limb(PIPE, pipe_views, [], basis, 12) is None
 
 
+def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View]) -> None:
+    basis = frame(PIPE, viewing_direction(PIPE, pipe_views))
+
+    def up_to(height: float) -> Cylinder:
+        share = (height - NEIGHBOUR.start[2]) / (NEIGHBOUR.end[2] - NEIGHBOUR.start[2])
+        return Cylinder(NEIGHBOUR.start, NEIGHBOUR.start + share * (NEIGHBOUR.end - NEIGHBOUR.start), NEIGHBOUR.radius)
+
+    nearly_all, half = up_to(0.08), up_to(-0.1)
+    assert lone_limb(PIPE, pipe_views, [nearly_all], basis, 12) == -side_of_the_neighbour(pipe_views)
+    assert refine(PIPE, SEEN.sigma, pipe_views, [nearly_all], ContourConfig(), follow=False) is None
+    assert lone_limb(PIPE, pipe_views, [half], basis, 12) is None
+
+
 def test_one_outline_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
     """A radius 4 mm too large whose surface lies where it was seen; to the cloud that is 1.6 sigma."""
     basis = frame(PIPE, viewing_direction(PIPE, pipe_views))
