@@ -33,7 +33,7 @@ def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View])
         share = (height - NEIGHBOUR.start[2]) / (NEIGHBOUR.end[2] - NEIGHBOUR.start[2])
         return Cylinder(NEIGHBOUR.start, NEIGHBOUR.start + share * (NEIGHBOUR.end - NEIGHBOUR.start), NEIGHBOUR.radius)
 
-    nearly_all, half = up_to(0.08), up_to(-0.1)
+    nearly_all, half = up_to(0.065), up_to(-0.1)
     assert lone_limb(PIPE, pipe_views, [nearly_all], basis, 12) == -side_of_the_neighbour(pipe_views)
     assert refine(PIPE, SEEN.sigma, pipe_views, [nearly_all], ContourConfig(), follow=False) is None
     assert lone_limb(PIPE, pipe_views, [half], basis, 12) is None
