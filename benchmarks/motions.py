@@ -85,7 +85,7 @@ def stop() -> Recorded:
     """A walk of 2 s, a stop of 20 s at 10 frames a second with a hand's tremor, and on."""
     frames = _rendered("along", ALONG, np.arange(0, 6, 1 / FPS))
     before, after = frames[: int(2 * FPS)], frames[int(2 * FPS) :]
-    still = _decoded(before[-1][1], cv2.IMREAD_COLOR)
+    still = decoded(before[-1][1], cv2.IMREAD_COLOR)
     rng = np.random.default_rng(SEED)
     held = []
     for n in range(200):
@@ -136,9 +136,21 @@ def main(names: list[str]) -> None:
 
 
 def survive(frames: Recorded) -> dict[str, Any]:
-    """Selector and mapper over a recording, in lockstep."""
+    """What selector and mapper make of a recording."""
+    stamps, mapper = mapped(frames, CAMERA)
+    return {
+        "frames": len(frames),
+        "keyframes": len(stamps),
+        "registered": mapper.registered,
+        "models": mapper.models,
+        "longest time without [s]": round(float(np.diff(stamps).max()) / SECOND, 2),
+    }
+
+
+def mapped(frames: Recorded, camera: Camera) -> tuple[list[int], Mapper]:
+    """Stamps of the keyframes of a recording and the mapper that has worked them off, in lockstep with the selector."""
     ring, mapper, images = FrameFile(), Mapper(SfmConfig().mapper), dict(frames)
-    stream = Stream(FramesConfig(), CAMERA, ring.middle)
+    stream = Stream(FramesConfig(), camera, ring.middle)
     changes: deque[Decision] = deque()
     keyframes: set[int] = set()
 
@@ -147,15 +159,15 @@ def survive(frames: Recorded) -> dict[str, Any]:
             decision = changes.popleft()
             if decision.chosen:
                 keyframes.add(decision.stamp)
-                mapper.add(decision.stamp, _decoded(images[decision.stamp], cv2.IMREAD_GRAYSCALE), CAMERA)
+                mapper.add(decision.stamp, decoded(images[decision.stamp], cv2.IMREAD_GRAYSCALE), camera)
             else:
                 keyframes.discard(decision.stamp)
                 mapper.retire([decision.stamp])
             changes.extend(stream.answer(_ties(mapper)))
 
     for stamp, encoded in frames:
-        ring.add(Frame(stamp, "camera", encoded, CAMERA))
-        decisions = stream.consider(stamp, partial(decode_reduced, encoded, WIDTH))
+        ring.add(Frame(stamp, "camera", encoded, camera))
+        decisions = stream.consider(stamp, partial(decode_reduced, encoded, camera.width))
         changes.extend(decision for decision in decisions if decision.chosen)
         work_off()
     changes.extend(decision for decision in stream.flush() if decision.chosen)
@@ -163,14 +175,7 @@ def survive(frames: Recorded) -> dict[str, Any]:
     while changes := deque(stream.settle()):
         work_off()
     mapper.finish()
-    stamps = sorted(keyframes)
-    return {
-        "frames": len(frames),
-        "keyframes": len(stamps),
-        "registered": mapper.registered,
-        "models": mapper.models,
-        "longest time without [s]": round(float(np.diff(stamps).max()) / SECOND, 2),
-    }
+    return sorted(keyframes), mapper
 
 
 def _ties(mapper: Mapper) -> list[Tie]:
@@ -200,7 +205,8 @@ def _frame(scene: Scene, path: Path, sensor: Sensor, time: float) -> bytes:
     return compress(develop(expose(scene, LENS, path, sensor, time), sensor, rng), sensor)
 
 
-def _decoded(encoded: bytes, flags: int) -> NDArray[np.uint8]:
+def decoded(encoded: bytes, flags: int) -> NDArray[np.uint8]:
+    """Image of an encoded frame, by OpenCV's flags."""
     image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)
     assert image is not None
     return image.astype(np.uint8, copy=False)
