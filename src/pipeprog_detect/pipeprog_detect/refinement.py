@@ -30,8 +30,10 @@ NEAR_PLANNED, AS_GOOD = 0.15, 0.6
 # Cloud and outlines contradict each other where their radii differ by so many standard deviations, noise included.
 CONTRADICTION = 4.0
 # The cloud resolves a section of five times its noise, seen along a third of the way around, whose radius it knows to a
-# twentieth: the edge of a box is round, too, to a cloud.
+# twentieth: the edge of a box is round, too, to a cloud. Two faces lie a tenth of the radius off the circle along both:
+# what is three times as smooth is round wherever it is seen.
 RESOLVED_RADII, RESOLVED_ARC, RESOLVED_SIGMA = 5.0, np.radians(120.0), 0.05
+ROUND_RADII = 30.0
 
 
 class Jury:
@@ -223,5 +225,8 @@ def _cut(line: Cylinder, ends: Cylinder) -> Cylinder:
 
 def _resolved(candidate: Candidate) -> bool:
     evidence, radius = candidate.evidence, candidate.cylinder.radius
-    known = candidate.radius_sigma < RESOLVED_SIGMA * radius
-    return known and radius > RESOLVED_RADII * evidence.noise and evidence.arc > RESOLVED_ARC
+    if candidate.radius_sigma > RESOLVED_SIGMA * radius:
+        return False
+    return radius > ROUND_RADII * evidence.noise or (
+        radius > RESOLVED_RADII * evidence.noise and evidence.arc > RESOLVED_ARC
+    )
