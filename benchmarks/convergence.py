@@ -30,7 +30,7 @@ from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
 from pipeprog_detect import background, normals, octree
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import refine
+from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.fit import basis
 from pipeprog_detect.hypotheses import Hypothesis
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
@@ -148,7 +148,9 @@ def contour(recordings: Sequence[Recording], starts: int, most_views: int) -> No
             others = pipes[:number] + pipes[number + 1 :]
             errors, sigmas = [], []
             for _ in track(range(starts), f"{recording.name}, pipe {number}"):
-                fit = refine(disturbed(pipe, rng), RADIUS_OFF_IMAGE * pipe.radius, views, others, ContourConfig())
+                fit = refine(
+                    Start(disturbed(pipe, rng), RADIUS_OFF_IMAGE * pipe.radius), views, others, ContourConfig()
+                )
                 if fit is not None:
                     errors.append(1e3 * (fit.cylinder.radius - pipe.radius))
                     sigmas.append(1e3 * fit.radius_sigma)

@@ -77,29 +77,49 @@ class ContourFit:
     flatness_sigma: float
 
 
+@dataclass(frozen=True)
+class Start:
+    """A cylinder before its outlines are asked, and what is known of it.
+
+    Attributes:
+        cylinder: where its outlines are sought.
+        radius_sigma: standard deviation of its radius [m]; that of its axis is taken as twice as much.
+        radius_known: outlines of other radii are not looked for.
+        depth_sigma: what the distance from the cameras is known to [m], where that is worse.
+        slope_sigma: what the slope towards the cameras is known to [rad].
+        ends_known: the surface was seen between the ends.
+        seen: what the cloud holds of it; where others hide one of its outlines in all views it stands for that one.
+    """
+
+    cylinder: Cylinder
+    radius_sigma: float
+    radius_known: bool = False
+    depth_sigma: float = 0.0
+    slope_sigma: float = np.inf
+    ends_known: bool = False
+    seen: SeenArc | None = None
+
+    def precision(self) -> FloatArray:
+        """(5, 5) [1/m^2] of `outline.moved`'s step; the radius is left to the outlines."""
+        known_to = np.full(5, 2.0 * self.radius_sigma)
+        known_to[[1, 3]] = max(2.0 * self.radius_sigma, self.depth_sigma)
+        known_to[4] = np.inf
+        slope = np.array([0.0, -1.0, 0.0, 1.0, 0.0]) / (self.slope_sigma * self.cylinder.length)
+        return np.diag(1.0 / known_to**2) + np.outer(slope, slope)
+
+
 def refine(
-    cylinder: Cylinder,
-    initial_radius_sigma: float,
+    start: Start,
     views: Sequence[View],
     others: Sequence[Cylinder],
     config: ContourConfig,
     planned_radii: Sequence[float] = (),
     follow: bool = True,
-    known_radius: bool = False,
-    depth_sigma: float = 0.0,
-    slope_sigma: float = np.inf,
-    ends_known: bool = False,
-    seen: SeenArc | None = None,
 ) -> ContourFit | None:
     """The cylinder that the outlines in all views agree on, or None where they say too little or are not to be used.
 
-    `initial_radius_sigma` [m] is the standard deviation of the given radius; that of the axis is taken as twice as
-    much. `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the
-    pipe is made as long as its outlines are seen, and its ends are looked for. With `known_radius` outlines of other
-    radii are not looked for; `depth_sigma` [m] is what the distance from the cameras is known to, where that is worse,
-    and `slope_sigma` [rad] what the slope towards them is known to. With `ends_known` the surface was seen between the
-    given ends. `seen` is what the cloud holds of it: where the others hide one of its outlines in all views it stands
-    for that one.
+    `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the pipe is
+    made as long as its outlines are seen, and its ends are looked for.
 
     Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
@@ -107,14 +127,9 @@ def refine(
     """
     if not config.enabled or not views:
         return None
+    cylinder, seen = start.cylinder, start.seen
     basis = frame(cylinder, viewing_direction(cylinder, views))
-    expected = (initial_radius_sigma, known_radius, depth_sigma)
-    candidates = _vote(cylinder, expected, views, others, basis, planned_radii)
-    known_to = np.full(5, 2.0 * initial_radius_sigma)
-    known_to[[1, 3]] = max(2.0 * initial_radius_sigma, depth_sigma)
-    known_to[4] = np.inf
-    slope = np.array([0.0, -1.0, 0.0, 1.0, 0.0]) / (slope_sigma * cylinder.length)
-    prior = np.diag(1.0 / known_to**2) + np.outer(slope, slope)
+    candidates, prior = _vote(start, views, others, basis, planned_radii), start.precision()
     if not len(candidates):
         limb = None if seen is None else lone_limb(cylinder, views, others, basis, CHUNK)
         if seen is None or limb is None:
@@ -124,10 +139,10 @@ def refine(
     still: FloatArray = np.zeros(len(views))
     blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, still, CHUNK)
     held = prior.copy()
-    held[4, 4] = 1.0 / RADIUS_HELD**2 if known_radius else 0.0
+    held[4, 4] = 1.0 / RADIUS_HELD**2 if start.radius_known else 0.0
     trials = [_improved(cylinder, candidate, scene, blur, held) for candidate in candidates]
     step, _ = max(trials, key=lambda trial: trial[1])
-    if known_radius:  # its own edges are found first, then they tell the radius
+    if start.radius_known:  # its own edges are found first, then they tell the radius
         first = _fine(moved(cylinder, basis, step), scene, blur, held, step)
         step = step if first is None else step + first.step
     refined = _fine(moved(cylinder, basis, step), scene, blur, prior, step)
@@ -160,7 +175,7 @@ def refine(
         whole, axis = refined.cylinder, refined.cylinder.axis
         further = float((cylinder.start - whole.start) @ axis), float((whole.end - cylinder.end) @ axis)
         ends = [
-            find_end(whole, at_end, views, others, offset, blur, -max(beyond, 0.0) if ends_known else None)
+            find_end(whole, at_end, views, others, offset, blur, -max(beyond, 0.0) if start.ends_known else None)
             for at_end, beyond in zip((False, True), further, strict=True)
         ]
     return _result(refined, basis, views, ends)
@@ -220,18 +235,14 @@ def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:
 
 
 def _vote(
-    cylinder: Cylinder,
-    expected: tuple[float, bool, float],
+    start: Start,
     views: Sequence[View],
     others: Sequence[Cylinder],
     basis: FloatArray,
     planned_radii: Sequence[float],
 ) -> FloatArray:
-    """Steps (K, 5) of `outline.moved` that most edges of all views support, best first; none where no two see it.
-
-    `expected`: standard deviation of the radius, whether it is known for sure, standard deviation of the depth [m].
-    """
-    sigma, known_radius, depth_sigma = expected
+    """Steps (K, 5) of `outline.moved` that most edges of all views support, best first; none where no two see it."""
+    cylinder, sigma = start.cylinder, start.radius_sigma
     at = stations(cylinder, views, basis, CHUNK)
     at = at.select(visible(cylinder, others, views, at))
     if len(np.unique(at.view)) < 2 or not shows_both(at):
@@ -241,9 +252,9 @@ def _vote(
     radius = cylinder.radius
     aside = float(np.clip(3.0 * sigma, 2.0 * pixel, 0.4 * radius))
     thicker = float(np.clip(2.5 * sigma, 2.0 * pixel, 0.3 * radius))
-    if known_radius:
+    if start.radius_known:
         aside, thicker = KNOWN_AXIS * radius, max(KNOWN_RADIUS * radius, 0.3 * pixel)
-    deep = max(aside, 2.0 * depth_sigma)
+    deep = max(aside, 2.0 * start.depth_sigma)
     reach = np.array([aside, deep, aside, deep, thicker])
     furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, (aside + thicker) * float(at.gain.max()))
     spacing = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.classify import is_planned
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import ContourFit, refine
+from pipeprog_detect.contour import ContourFit, Start, refine
 from pipeprog_detect.extent import Run
 from pipeprog_detect.measured import Measured, is_known, is_stub
 from pipeprog_detect.outline import viewing_direction
@@ -106,8 +106,8 @@ class _Lines:
         follow: bool = True,
     ) -> ContourFit | None:
         """The fit where it has the outlines of a pipe and a planned size."""
-        sigma, radii = proposed.radius, self.radii
-        fit = refine(proposed, sigma, self.views, known, self.config, radii, follow, True, depth_sigma, slope_sigma)
+        start = Start(proposed, proposed.radius, True, depth_sigma, slope_sigma)
+        fit = refine(start, self.views, known, self.config, self.radii, follow)
         if fit is None or fit.support < LINES_CONVINCING:
             return None
         if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.bill):

@@ -10,7 +10,7 @@ import numpy as np
 from pipeprog_detect.bill import Bill
 from pipeprog_detect.classify import is_planned
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import ContourFit, refine
+from pipeprog_detect.contour import ContourFit, Start, refine
 from pipeprog_detect.lone_limb import SeenArc
 from pipeprog_detect.measured import Measured, is_known, is_stub
 from pipeprog_detect.memory import Memory
@@ -119,9 +119,8 @@ class Jury:
             one.outer_radius for one in self._bill.classes if abs(one.outer_radius / radius - 1.0) < NEAR_PLANNED
         ]
         for size in planned:
-            start = replace(fit.cylinder, radius=size)
-            sigma = abs(size - radius)
-            again = refine(start, sigma, self._views, others, self._config, (), known_radius=True, ends_known=True)
+            start = Start(replace(fit.cylinder, radius=size), abs(size - radius), radius_known=True, ends_known=True)
+            again = refine(start, self._views, others, self._config)
             if (
                 again is not None
                 and is_planned(again.cylinder.radius, again.radius_sigma, self._bill)
@@ -139,8 +138,9 @@ class Jury:
         sigma, fits = candidate.evidence.noise, []
         for one in self._bill.classes:
             if candidate.blurred and abs(one.outer_radius - candidate.cylinder.radius) < reach:
-                start = replace(candidate.cylinder, radius=one.outer_radius)
-                fit = refine(start, sigma, self._views, others, self._config, (), known_radius=True, ends_known=True)
+                cylinder = replace(candidate.cylinder, radius=one.outer_radius)
+                start = Start(cylinder, sigma, radius_known=True, ends_known=True)
+                fit = refine(start, self._views, others, self._config)
                 if (
                     fit is not None
                     and fit.support > CONVINCING
@@ -172,14 +172,12 @@ class Jury:
             starts += [radius for radius in planned_radii if abs(radius - cylinder.radius) < 3.0 * sigma]
         fits = []
         for radius in starts:
-            start = replace(cylinder, radius=radius)
+            start = Start(replace(cylinder, radius=radius), sigma, ends_known=True, seen=seen)
             for _ in range(MAX_ROUNDS):
-                fit = refine(
-                    start, sigma, views, others, self._config, planned_radii, follow, ends_known=True, seen=seen
-                )
-                if fit is None or abs(fit.cylinder.radius - start.radius) < SETTLED * start.radius:
+                fit = refine(start, views, others, self._config, planned_radii, follow)
+                if fit is None or abs(fit.cylinder.radius / start.cylinder.radius - 1.0) < SETTLED:
                     break
-                start = _cut(fit.cylinder, cylinder)
+                start = replace(start, cylinder=_cut(fit.cylinder, cylinder))
             if fit is not None:
                 fits.append(fit)
         best = max(fits, key=lambda fit: fit.support, default=None)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import refine
+from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.outline import frame
 from pipeprog_detect.pipe import Cylinder, View
 from pipeprog_detect.support import support
@@ -32,7 +32,7 @@ def disturbed(random: np.random.Generator) -> Cylinder:
 def test_converges_from_every_start_beside_a_shadow(pipe_views: list[View]) -> None:
     random = np.random.default_rng(5)
     for _ in range(4):
-        fit = refine(disturbed(random), 0.1 * PIPE.radius, pipe_views, [], CONFIG)
+        fit = refine(Start(disturbed(random), 0.1 * PIPE.radius), pipe_views, [], CONFIG)
         assert fit is not None
         assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=RADIUS_TOLERANCE)
         assert abs(fit.cylinder.radius - PIPE.radius) < 3.0 * fit.radius_sigma < 2e-3
@@ -50,8 +50,8 @@ def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[
         pose = view.camera_from_map.copy()
         pose[:3, 3] += random.normal(0.0, 1.5e-3, 3)
         noisy.append(dataclasses.replace(view, camera_from_map=pose))
-    clean = refine(PIPE, 0.002, pipe_views, [], CONFIG)
-    fit = refine(PIPE, 0.002, noisy, [], CONFIG)
+    clean = refine(Start(PIPE, 0.002), pipe_views, [], CONFIG)
+    fit = refine(Start(PIPE, 0.002), noisy, [], CONFIG)
     assert clean is not None
     assert fit is not None
     assert abs(fit.cylinder.radius - PIPE.radius) < 3.0 * fit.radius_sigma
@@ -61,22 +61,22 @@ def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[
 
 def test_the_ends_are_found_from_a_short_start(pipe_views: list[View]) -> None:
     short = Cylinder(PIPE.start + 0.04 * PIPE.axis, PIPE.end - 0.04 * PIPE.axis, PIPE.radius)
-    fit = refine(short, 0.002, pipe_views, [], CONFIG)
+    fit = refine(Start(short, 0.002), pipe_views, [], CONFIG)
     assert fit is not None
     # One pixel along the pipe, and what the rim is worth against it.
     assert fit.cylinder.length == pytest.approx(PIPE.length, abs=3.5e-3)
 
 
 def test_a_catalogue_radius_does_not_pull(pipe_views: list[View]) -> None:
-    free = refine(PIPE, 0.003, pipe_views, [], CONFIG)
-    seeded = refine(PIPE, 0.003, pipe_views, [], CONFIG, planned_radii=(0.042, 0.0365))
+    free = refine(Start(PIPE, 0.003), pipe_views, [], CONFIG)
+    seeded = refine(Start(PIPE, 0.003), pipe_views, [], CONFIG, planned_radii=(0.042, 0.0365))
     assert free is not None
     assert seeded is not None
     assert seeded.cylinder.radius == pytest.approx(free.cylinder.radius, abs=2e-5)
 
 
 def test_same_input_same_result(pipe_views: list[View]) -> None:
-    first, second = (refine(PIPE, 0.003, pipe_views, [], CONFIG) for _ in range(2))
+    first, second = (refine(Start(PIPE, 0.003), pipe_views, [], CONFIG) for _ in range(2))
     assert first is not None
     assert second is not None
     assert first.cylinder.radius == second.cylinder.radius
@@ -84,11 +84,11 @@ def test_same_input_same_result(pipe_views: list[View]) -> None:
 
 
 def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
-    assert refine(PIPE, 0.004, empty_views, [], CONFIG) is None
-    assert refine(PIPE, 0.004, [], [], CONFIG) is None
-    assert refine(PIPE, 0.004, empty_views, [], ContourConfig(enabled=False)) is None
+    assert refine(Start(PIPE, 0.004), empty_views, [], CONFIG) is None
+    assert refine(Start(PIPE, 0.004), [], [], CONFIG) is None
+    assert refine(Start(PIPE, 0.004), empty_views, [], ContourConfig(enabled=False)) is None
     above = Cylinder(PIPE.start + 3.0 * UP, PIPE.end + 3.0 * UP, PIPE.radius)
-    assert refine(above, 0.004, empty_views, [], CONFIG) is None
+    assert refine(Start(above, 0.004), empty_views, [], CONFIG) is None
 
 
 def test_support_tells_a_pipe_from_a_guess(pipe_views: list[View], empty_views: list[View]) -> None:
@@ -100,6 +100,6 @@ def test_support_tells_a_pipe_from_a_guess(pipe_views: list[View], empty_views: 
 
 def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:
     screen = Cylinder(np.array([-0.5, -0.3, 0.0]), np.array([0.5, -0.3, 0.0]), 0.05)
-    fit = refine(PIPE, 0.002, pipe_views, [screen], CONFIG)
+    fit = refine(Start(PIPE, 0.002), pipe_views, [screen], CONFIG)
     assert fit is not None
     assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=2.0 * RADIUS_TOLERANCE)

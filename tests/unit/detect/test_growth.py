@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import refine
+from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.growth import grown, outline_evidence
 from pipeprog_detect.pipe import Cylinder, View
 
@@ -19,12 +19,12 @@ STATIONS_TOLERANCE = 0.03  # outlines alone tell an end to two stations of 6 px
 @pytest.mark.parametrize("piece", [(0.0, 0.16), (0.12, 0.28), (0.24, 0.4)])
 def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[float, float]) -> None:
     low, high = (PIPE.start + place * PIPE.axis for place in piece)
-    fit = refine(Cylinder(low, high, PIPE.radius), 0.002, pipe_views, [], ContourConfig())
+    fit = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], ContourConfig())
     assert fit is not None
     assert (fit.cylinder.start - PIPE.start) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
     assert (fit.cylinder.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
     assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=0.5e-3)
-    short = refine(Cylinder(low, high, PIPE.radius), 0.002, pipe_views, [], ContourConfig(), follow=False)
+    short = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], ContourConfig(), follow=False)
     assert short is not None
     assert short.cylinder.length < 0.2
 

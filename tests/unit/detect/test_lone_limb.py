@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import refine
+from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.lone_limb import SeenArc, lone_limb, precision
 from pipeprog_detect.outline import frame, moved, viewing_direction
 from pipeprog_detect.pipe import Cylinder, View
@@ -35,7 +35,7 @@ def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View])
 
     nearly_all, half = up_to(0.065), up_to(-0.1)
     assert lone_limb(PIPE, pipe_views, [nearly_all], basis, 12) == -side_of_the_neighbour(pipe_views)
-    assert refine(PIPE, SEEN.sigma, pipe_views, [nearly_all], ContourConfig(), follow=False) is None
+    assert refine(Start(PIPE, SEEN.sigma), pipe_views, [nearly_all], ContourConfig(), follow=False) is None
     assert lone_limb(PIPE, pipe_views, [half], basis, 12) is None
 
 
@@ -46,8 +46,8 @@ def test_one_outline_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
     middle = np.array([-side_of_the_neighbour(pipe_views) * np.cos(half), -np.sin(half)])
     step = np.concatenate([-0.004 * middle, -0.004 * middle, [0.004]])
     start = moved(PIPE, basis, step)
-    assert refine(start, SEEN.sigma, pipe_views, [NEIGHBOUR], ContourConfig(), follow=False) is None
-    fit = refine(start, SEEN.sigma, pipe_views, [NEIGHBOUR], ContourConfig(), follow=False, seen=SEEN)
+    assert refine(Start(start, SEEN.sigma), pipe_views, [NEIGHBOUR], ContourConfig(), follow=False) is None
+    fit = refine(Start(start, SEEN.sigma, seen=SEEN), pipe_views, [NEIGHBOUR], ContourConfig(), follow=False)
     assert fit is not None
     assert abs(fit.cylinder.radius - PIPE.radius) < 0.5 * abs(start.radius - PIPE.radius)
     assert abs(fit.cylinder.radius - PIPE.radius) < 2.0 * fit.radius_sigma < 6e-3

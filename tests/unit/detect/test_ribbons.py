@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import refine
+from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.lines import ribbons, straight_edges
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.ribbons import SAME_LINE, covers, laid, mean_centre, propose
@@ -75,14 +75,14 @@ def test_known_pipes_and_strips_on_the_wall_are_not_proposed(pipe_views: list[Vi
 
 
 def test_outlines_of_a_strip_stay_where_they_are(pipe_views: list[View]) -> None:
-    pipe = refine(PIPE, 0.004, pipe_views, [], ContourConfig())
+    pipe = refine(Start(PIPE, 0.004), pipe_views, [], ContourConfig())
     assert pipe is not None
     assert abs(pipe.flatness) < 0.3
     assert pipe.flatness_sigma < 0.3
     # The shadow is seen beside the pipe in the lower half of the walk's images, too.
     at = np.array([SHADOW + SHADOW_RADIUS, WALL, 0.0])
     up = np.array([0.0, 0.0, 0.2])
-    strip = refine(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002, pipe_views, [PIPE], ContourConfig())
+    strip = refine(Start(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002), pipe_views, [PIPE], ContourConfig())
     assert strip is None or strip.flatness - 0.5 > -strip.flatness_sigma
 
 
@@ -127,8 +127,8 @@ def test_a_known_slope_holds_what_one_height_leaves_open(pipe_views: list[View])
     """From cameras almost in a plane with the axis the slope towards them is seen badly; that is what is given."""
     few = pipe_views[2:6]
     sloping = Cylinder(PIPE.start + np.array([0.0, 0.02, 0.0]), PIPE.end, PIPE.radius)
-    free = refine(sloping, PIPE.radius, few, [], ContourConfig(), RADII, False, True, 0.03)
-    held = refine(sloping, PIPE.radius, few, [], ContourConfig(), RADII, False, True, 0.03, np.radians(0.05))
+    free = refine(Start(sloping, PIPE.radius, True, 0.03), few, [], ContourConfig(), RADII, False)
+    held = refine(Start(sloping, PIPE.radius, True, 0.03, np.radians(0.05)), few, [], ContourConfig(), RADII, False)
     assert free is not None
     assert held is not None
     turned = [np.arccos(min(abs(float(fit.cylinder.axis @ sloping.axis)), 1.0)) for fit in (free, held)]
