@@ -89,7 +89,7 @@ def estimate_noise(tree: Octree, most_cells: int = 20000) -> float:
     """Standard deviation [m] of the points across the surfaces: the median over small patches of a quadric's residual.
 
     The patches are cells of 3 cm, or larger where the cloud is too thin to fill them; edges and double surfaces are
-    few and only lengthen the upper tail.
+    few and only lengthen the upper tail. Where no patch tells, it is what the tree rounds the points to, and no less.
     """
     for level in range(tree.level_of(0.03), tree.level_of(1.0) + 1):
         cells = tree.cells(level)
@@ -97,11 +97,11 @@ def estimate_noise(tree: Octree, most_cells: int = 20000) -> float:
         if len(full) >= 20 and cells.counts[full].sum() > 0.2 * len(tree.points):
             break
     else:
-        return 0.0
+        return tree.quantum
     chosen: IntArray = full[:: max(1, len(full) // most_cells)]
     residual = _patch_residuals(tree.points, cells.starts[chosen], cells.starts[chosen + 1], cells.size)
     clean = residual[residual > 0]
-    return float(np.median(clean)) / _TUKEY_SHRINKAGE if len(clean) else 0.0
+    return max(float(np.median(clean)) / _TUKEY_SHRINKAGE, tree.quantum) if len(clean) else tree.quantum
 
 
 @njit(cache=True, nogil=True)

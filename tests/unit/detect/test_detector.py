@@ -154,3 +154,11 @@ def test_progress_is_told_and_ends_at_one() -> None:
     detect(Cloud(scene()[::4]), BILL, CONFIG, progress=lambda share, _: told.append(share))
     assert told == sorted(told)
     assert told[-1] == 1.0
+
+
+@pytest.mark.parametrize("front_end", ["normals", "planes"])
+def test_a_cloud_too_thin_to_tell_its_noise_holds_no_pipes(front_end: str) -> None:
+    """A few keyframes far apart leave such a cloud: a handful of points here and there."""
+    rng = np.random.default_rng(3)
+    clumps = rng.uniform(0, 10, (40, 1, 3)) + rng.uniform(-0.03, 0.03, (40, 12, 3))
+    assert detect(Cloud(clumps.reshape(-1, 3)), BILL, DetectConfig(front_end=front_end)) == []
