@@ -444,9 +444,11 @@ def _lines(
             for overlap in OVERLAPS[layout]
             if (known := of.get((layout, method, overlap))) and (value := quantity(known)) is not None
         ]
-        panel.plot([x for x, _ in points], [y for _, y in points], "o-", color=f"C{number}", label=TITLES[method])
+        if points:
+            panel.plot(*zip(*points, strict=True), "o-", color=f"C{number}", label=TITLES[method])
     paper = [(x, known[name]) for (where, x), known in PAPER.items() if where == layout and name in known]
-    panel.plot([x for x, _ in paper], [y for _, y in paper], "k*", label="paper's figure")
+    if paper:
+        panel.plot(*zip(*paper, strict=True), "k*", label="paper's figure")
     panel.set(xlabel="least overlap [%]", ylabel=name)
     panel.set_ylim(bottom=0)
 
