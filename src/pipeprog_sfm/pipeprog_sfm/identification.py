@@ -38,7 +38,7 @@ def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) 
     best = np.sort(np.argsort(ellipses.rms, kind="stable")[:MAX_CANDIDATES])
     free = np.zeros(len(ellipses), bool)
     free[best] = True
-    matrix, found, least = camera.matrix, [], []
+    matrix, found, partial = camera.matrix, [], []
 
     def take(board: Board, fit: BoardFit) -> None:
         free[fit.members] = False
@@ -51,12 +51,12 @@ def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) 
             fit = _verify(ellipses, free, board, camera, circles, members)
             if fit is None:
                 continue
-            if len(fit.circles) > LEAST_CIRCLES:
+            if len(fit.circles) == len(board.centres):
                 take(board, fit)
             else:
-                least.append((board, fit))
-    # Three circles may fit by chance: they must not take an ellipse from a board of which more is seen.
-    for board, fit in least:
+                partial.append((board, fit))
+    # Some of the circles may fit by chance, or upside down: they must not take an ellipse from what shows more.
+    for board, fit in sorted(partial, key=lambda each: -len(each[1].circles)):
         if free[fit.members].all():
             take(board, fit)
     return found
