@@ -52,8 +52,8 @@ def find_lost(
     thin = [planned.outer_radius for planned in bill.classes if planned.outer_radius < thickest]
     if not views or not thin:
         return []
-    some = points[:: -(-len(points) // MOST_POINTS)].astype(np.float32)
     lines = _Lines(views, points.astype(np.float32), thin, bill, config)
+    some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
     lost: list[Measured] = []
     for proposed in propose(views, some, thin, known, MOST_LOST, edges):

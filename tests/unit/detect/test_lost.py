@@ -6,19 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeprog_camera.camera import Camera
 from pipeprog_detect.lost import aligned
-from pipeprog_detect.pipe import Cylinder, FloatArray, View
-
-CAMERA = Camera(480, 270, 345.0, 345.0, 239.5, 134.5)
-
-
-def looking_along_y(x: float, stamp: int) -> View:
-    """A view of nothing from (x, -1.2, 0)."""
-    pose = np.eye(4)
-    pose[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    pose[:3, 3] = -pose[:3, :3] @ np.array([x, -1.2, 0.0])
-    return View(stamp, np.full((CAMERA.height, CAMERA.width), 90, np.uint8), CAMERA, pose)
+from pipeprog_detect.pipe import Cylinder, FloatArray
+from tests.unit.detect.straight_ahead import looking_along_y
 
 
 def level(length: float, slope: float = 0.0, turn: float = 0.0) -> Cylinder:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.outline import frame, moved, outline, project, showing, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, View
+from tests.unit.detect.straight_ahead import looking_along_y
 
 CAMERA = Camera(1280, 720, 914.0, 910.0, 640.2, 358.7)
 BLANK = np.zeros((720, 1280), np.uint8)
@@ -92,13 +93,7 @@ def test_nearer_pipe_hides_what_lies_behind_it() -> None:
 
 
 def test_the_few_views_show_the_place_and_are_spread_over_those_that_do() -> None:
-    camera = Camera(480, 270, 345.0, 345.0, 239.5, 134.5)
-    along_y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    views = []
-    for number in range(200):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = along_y, -along_y @ np.array([0.05 * number, -1.2, 0.0])
-        views.append(View(number, np.zeros((270, 480), np.uint8), camera, pose))
+    views = [looking_along_y(0.05 * number, number) for number in range(200)]
     place = np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
     able = [view.stamp for view in views if 0.05 * view.stamp < 0.2 + 1.2 * 239.5 / 345.0]
     few = [view.stamp for view in showing(place, views, 10)]

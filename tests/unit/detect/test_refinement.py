@@ -4,26 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeprog_camera.camera import Camera
 from pipeprog_detect.bill import Bill, PipeClass
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.extent import Run
 from pipeprog_detect.pipe import Cylinder, View
 from pipeprog_detect.refinement import Jury
 from pipeprog_detect.verify import Candidate, Evidence
+from tests.unit.detect.straight_ahead import looking_along_y
 
 # The pipe of `pipe_views`.
 PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 BILL = Bill((PipeClass("DN65", PIPE.radius, 3.0, (0.0, 0.0, 1.0), 4e-4),))
-CAMERA = Camera(480, 270, 345.0, 345.0, 239.5, 134.5)
-
-
-def looking_along_y(x: float, stamp: int) -> View:
-    """A view of nothing from (x, -1.2, 0)."""
-    pose = np.eye(4)
-    pose[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    pose[:3, 3] = -pose[:3, :3] @ np.array([x, -1.2, 0.0])
-    return View(stamp, np.full((CAMERA.height, CAMERA.width), 90, np.uint8), CAMERA, pose)
 
 
 def test_a_pipe_that_few_keyframes_of_many_show_is_vouched_for(pipe_views: list[View]) -> None:

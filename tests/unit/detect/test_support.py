@@ -46,7 +46,7 @@ def test_an_edge_that_is_one_outline_of_a_cylinder_is_not_both(pipe_views: list[
 
 @pytest.mark.parametrize("views", [3, 4, 5, 8, 20])
 def test_few_views_of_a_real_outline_count_as_well_as_many(views: int) -> None:
-    """Edges that are found at chance in each view: 7 of 10 on a pipe, 1 of 4 on what is none."""
+    """Edges that are found at chance in each view: 7 of 10 on a pipe, 1 of 5 on what is none."""
     random = np.random.default_rng(views)
     seen = np.full((4000, 2), float(views))
     along: FloatArray = np.linspace(-1.0, 1.0, len(seen)).astype(np.float64)

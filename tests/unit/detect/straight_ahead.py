@@ -1,0 +1,18 @@
+"""Views straight ahead, from places in a row."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeprog_camera.camera import Camera
+from pipeprog_detect.pipe import View
+
+CAMERA = Camera(480, 270, 345.0, 345.0, 239.5, 134.5)
+
+
+def looking_along_y(x: float, stamp: int) -> View:
+    """A view of nothing from (x, -1.2, 0)."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    pose[:3, 3] = -pose[:3, :3] @ np.array([x, -1.2, 0.0])
+    return View(stamp, np.full((CAMERA.height, CAMERA.width), 90, np.uint8), CAMERA, pose)
