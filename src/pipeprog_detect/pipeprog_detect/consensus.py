@@ -2,15 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import qmc
 
-from pipeprog_detect.edges import WINDOW_OF_HALF_WIDTH
+from pipeprog_detect.edges import WINDOW_OF_HALF_WIDTH, profiles
 from pipeprog_detect.outline import Stations
-from pipeprog_detect.pipe import FloatArray
+from pipeprog_detect.pipe import FloatArray, View
+
+
+def vote(
+    views: Sequence[View],
+    at: Stations,
+    reach: FloatArray,
+    furthest: float,
+    half_chunk: int,
+    seeds: FloatArray | None = None,
+) -> FloatArray:
+    """Steps (E, 5) of `outline.moved` within +-`reach` (5,) [m] that most edges of all views support, best first.
+
+    `at`: the outlines before the step, which moves them by `furthest` [px] at most. `seeds` (S, 5) are tried, too.
+    """
+    furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, furthest)
+    spacing = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))
+    offsets = np.arange(-np.ceil(furthest / spacing) - 2, np.ceil(furthest / spacing) + 3) * spacing
+    response = responses(profiles(views, at, offsets, half_chunk), offsets, at)
+    none = np.zeros((0, 5))
+    return search(at, response, offsets, reach, none if seeds is None else seeds, np.random.default_rng(0))
 
 
 def responses(values: NDArray[np.floating], offsets: FloatArray, at: Stations) -> NDArray[np.float32]:

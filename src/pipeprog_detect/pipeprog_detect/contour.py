@@ -9,16 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.consensus import distinct, responses, search
+from pipeprog_detect.consensus import distinct, vote
 from pipeprog_detect.edges import (
-    WINDOW_OF_HALF_WIDTH,
     LimbEdges,
     estimate_blur,
     outline_edges,
-    profiles,
     sideways,
 )
-from pipeprog_detect.growth import LEAST, grown
+from pipeprog_detect.growth import AHEAD, FARTHEST, LEAST, TOLERANCE, grown
 from pipeprog_detect.lone_limb import SeenArc, lone_limb, precision, shows_both
 from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
@@ -38,6 +36,10 @@ KNOWN_RADIUS, KNOWN_AXIS = 0.02, 0.5
 RADIUS_HELD = 1e-4
 # Where the vote cannot tell, so many candidates compete on sub-pixel edges.
 CANDIDATES = 3
+# Stations that suffice for a vote.
+VOTERS = 1500
+# Standard deviations within which what is known of a direction is sought.
+SURELY = 3.0
 # Edges count within so many pixels of the vote's and of the refined outlines.
 COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
 MIN_STATIONS = 20
@@ -84,7 +86,7 @@ class Start:
     Attributes:
         cylinder: where its outlines are sought.
         radius_sigma: standard deviation of its radius [m]; that of its axis is taken as twice as much.
-        radius_known: outlines of other radii are not looked for.
+        radius_known: outlines of other radii are not looked for; a piece that is not followed keeps this one.
         depth_sigma: what the distance from the cameras is known to [m], where that is worse.
         slope_sigma: what the slope towards the cameras is known to [rad].
         ends_known: the surface was seen between the ends.
@@ -121,7 +123,7 @@ def refine(
     `others` are further cylinders that may hide this one; `planned_radii` only seed the vote. With `follow` the pipe is
     made as long as its outlines are seen, and its ends are looked for.
 
-    Two stages: a vote over all edges near the predicted outlines (`consensus.search`), which finds the one rigid
+    Two stages: a vote over all edges near the predicted outlines (`consensus.vote`), which finds the one rigid
     cylinder that explains most of them, since a shadow's or a neighbour's edge drifts against the pipe as the camera
     moves; then robust least squares on limb-aware sub-pixel edges. The ends follow from the rims (`rim.find_end`).
     """
@@ -139,34 +141,16 @@ def refine(
     still: FloatArray = np.zeros(len(views))
     blur = estimate_blur(moved(cylinder, basis, candidates[0]), *scene, still, CHUNK)
     held = prior.copy()
-    held[4, 4] = 1.0 / RADIUS_HELD**2 if start.radius_known else 0.0
-    trials = [_improved(cylinder, candidate, scene, blur, held) for candidate in candidates]
+    held[4, 4] = 1.0 / RADIUS_HELD**2
+    first = held if start.radius_known else prior
+    trials = [_improved(cylinder, candidate, scene, blur, first) for candidate in candidates]
     step, _ = max(trials, key=lambda trial: trial[1])
-    if start.radius_known:  # its own edges are found first, then they tell the radius
-        first = _fine(moved(cylinder, basis, step), scene, blur, held, step)
-        step = step if first is None else step + first.step
-    refined = _fine(moved(cylinder, basis, step), scene, blur, prior, step)
-    for _ in range(MAX_GROWTH if follow else 0):
-        if refined is None:
-            break
-        longer = grown(refined.cylinder, views, others, refined.solution.view_offset, blur)
-        if longer.length < refined.cylinder.length + LEAST:
-            break
-        # The direction that was known of the shorter one leaves the longer one's ends uncertain by as much more.
-        weaker = prior * (refined.cylinder.length / longer.length) ** 2
-        turned = frame(longer, viewing_direction(longer, views))
-        again = _fine(longer, (views, others, turned), blur, weaker, np.zeros(5))
-        if again is None or again.share < LOST * refined.share:
-            break
-        changed = abs(again.cylinder.radius - refined.cylinder.radius)
-        sigma = np.sqrt(refined.solution.covariance[4, 4] + (MODEL_ERROR / np.median(refined.at.gain)) ** 2)
-        # There may be more of it that is of less use to measure it by.
-        strays = _strays(again.cylinder, refined, basis)
-        if again.share < WORSE * refined.share or changed > SAME_RADIUS * sigma or strays:
-            refined = replace(refined, cylinder=longer)
-            continue
-        refined, basis = again, turned
-        scene = (views, others, basis)
+    refined = _fine(moved(cylinder, basis, step), scene, blur, first, step)
+    if refined is not None and start.radius_known and follow:  # its own edges, once found, tell the radius
+        step = step + refined.step
+        refined = _fine(moved(cylinder, basis, step), scene, blur, prior, step)
+    if refined is not None and follow:
+        refined, basis = _followed(refined, scene, blur, prior, held)
     if refined is None or refined.share < MIN_SUPPORT or refined.cylinder.radius <= 0:
         return None
     ends: list[End | None] = [None, None]
@@ -193,6 +177,42 @@ class _Refined:
     edges: LimbEdges
 
 
+def _followed(
+    known: _Refined,
+    scene: tuple[Sequence[View], Sequence[Cylinder], FloatArray],
+    blur: float,
+    prior: FloatArray,
+    held: FloatArray,
+) -> tuple[_Refined, FloatArray]:
+    """A pipe of which a piece is known, as long as its outlines are seen, and the frame (2, 3) of its solution."""
+    views, others, basis = scene
+    for _ in range(MAX_GROWTH):
+        length, offset = known.cylinder.length, known.solution.view_offset
+        longer = grown(known.cylinder, views, others, offset, blur)
+        if longer.length < length + LEAST:
+            swung = _swung(known, (views, others, basis), blur, held)
+            longer = longer if swung is None else grown(swung, views, others, offset, blur)
+        if longer.length < length + LEAST:
+            break
+        # The direction that was known of the shorter one leaves the longer one's ends uncertain by as much more.
+        weaker = prior * (length / longer.length) ** 2
+        turned = frame(longer, viewing_direction(longer, views))
+        again = _fine(longer, (views, others, turned), blur, weaker, np.zeros(5))
+        if again is None or again.share < LOST * known.share:
+            break
+        if again.share < WORSE * known.share or _widens(again, known) or _strays(again.cylinder, known, basis):
+            known = replace(known, cylinder=longer)  # there may be more of it that is of less use to measure it by
+        else:
+            known, basis = again, turned
+    return known, basis
+
+
+def _widens(longer: _Refined, known: _Refined) -> bool:
+    """Whether a longer cylinder has another radius than the known one."""
+    sigma = np.sqrt(known.solution.covariance[4, 4] + (MODEL_ERROR / np.median(longer.at.gain)) ** 2)
+    return bool(abs(longer.cylinder.radius - known.cylinder.radius) > SAME_RADIUS * sigma)
+
+
 def _strays(longer: Cylinder, known: _Refined, basis: FloatArray) -> bool:
     """Whether the axis of a longer cylinder leaves the ends of the known one, whose step's frame is `basis` (2, 3)."""
     ends = np.stack([known.cylinder.start, known.cylinder.end]) - longer.start
@@ -202,6 +222,34 @@ def _strays(longer: Cylinder, known: _Refined, basis: FloatArray) -> bool:
     covariance = known.solution.covariance[:4, :4] + systematic**2 * np.eye(4)
     surely = float(offset @ np.linalg.solve(covariance, offset)) > SAME_AXIS
     return surely and float(np.linalg.norm(aside, axis=1).max()) > ASIDE * known.cylinder.radius
+
+
+def _swung(
+    known: _Refined, scene: tuple[Sequence[View], Sequence[Cylinder], FloatArray], blur: float, held: FloatArray
+) -> Cylinder | None:
+    """The known cylinder in the direction that most edges ahead of it agree with.
+
+    None where its direction is known well enough to look ahead, or where too little is seen there.
+    """
+    views, others, basis = scene
+    cylinder = known.cylinder
+    share = min(AHEAD, FARTHEST / cylinder.length)
+    further = share * cylinder.length * cylinder.axis
+    longer = Cylinder(cylinder.start - further, cylinder.end + further, cylinder.radius)
+    ends = np.kron([[1.0 + share, -share], [-share, 1.0 + share]], np.eye(2))
+    reach = SURELY * np.sqrt(np.diag(ends @ known.solution.covariance[:4, :4] @ ends.T))
+    gain = float(np.median(known.at.gain))
+    if reach.max() * gain < TOLERANCE:
+        return None
+    at = stations(longer, views, basis, CHUNK)
+    at = _some(at.select(visible(longer, others, views, at)))
+    steps = vote(views, at, np.append(reach, RADIUS_HELD), reach.max() * float(at.gain.max()), CHUNK // 2)
+    swung = _fine(moved(longer, basis, steps[0]), scene, blur, held, np.zeros(5))
+    if swung is None:
+        return None
+    middle = 0.5 * (swung.cylinder.start + swung.cylinder.end)
+    half = 0.5 * cylinder.length * swung.cylinder.axis
+    return Cylinder(middle - half, middle + half, cylinder.radius)
 
 
 def _fine(
@@ -247,7 +295,7 @@ def _vote(
     at = at.select(visible(cylinder, others, views, at))
     if len(np.unique(at.view)) < 2 or not shows_both(at):
         return np.zeros((0, 5))
-    at = at.select(np.arange(0, len(at), max(len(at) // 1500, 1)))
+    at = _some(at)
     pixel = 1.0 / float(np.median(at.gain))
     radius = cylinder.radius
     aside = float(np.clip(3.0 * sigma, 2.0 * pixel, 0.4 * radius))
@@ -256,15 +304,16 @@ def _vote(
         aside, thicker = KNOWN_AXIS * radius, max(KNOWN_RADIUS * radius, 0.3 * pixel)
     deep = max(aside, 2.0 * start.depth_sigma)
     reach = np.array([aside, deep, aside, deep, thicker])
-    furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, (aside + thicker) * float(at.gain.max()))
-    spacing = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))
-    offsets = np.arange(-np.ceil(furthest / spacing) - 2, np.ceil(furthest / spacing) + 3) * spacing
-    response = responses(profiles(views, at, offsets, CHUNK // 2), offsets, at)
     near = [value - radius for value in planned_radii if abs(value - radius) < thicker]
     seeds = np.zeros((len(near), 5))
     seeds[:, 4] = near
-    best = search(at, response, offsets, reach, seeds, np.random.default_rng(0))
+    best = vote(views, at, reach, (aside + thicker) * float(at.gain.max()), CHUNK // 2, seeds)
     return distinct(best, at, 0.8, CANDIDATES)
+
+
+def _some(at: Stations) -> Stations:
+    """Stations that suffice for a vote."""
+    return at.select(np.arange(0, len(at), max(len(at) // VOTERS, 1)))
 
 
 def _improved(

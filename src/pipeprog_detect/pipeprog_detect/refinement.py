@@ -27,8 +27,10 @@ SETTLED, MAX_ROUNDS = 0.1, 3
 FEW_VIEWS = 30
 # A planned size so near to a radius that is none is tried, and taken with so much of its outlines' support.
 NEAR_PLANNED, AS_GOOD = 0.15, 0.6
-# Cloud and outlines contradict each other where their radii differ by so many standard deviations, noise included.
+# Cloud and outlines contradict each other where their radii differ by so many standard deviations, noise included, ...
 CONTRADICTION = 4.0
+# ... and agree where they differ by no more than so many without it.
+AGREEMENT = 2.0
 # The cloud resolves a section of five times its noise, seen along a third of the way around, whose radius it knows to a
 # twentieth: the edge of a box is round, too, to a cloud. Two faces lie a tenth of the radius off the circle along both:
 # what is three times as smooth is round wherever it is seen.
@@ -52,16 +54,21 @@ class Jury:
     def vouches_for(self, candidate: Candidate) -> bool:
         """Whether the keyframes make a pipe of a candidate of which the cloud alone is not sure.
 
-        They must show most of its outlines, and these must have a planned size: shadows have outlines, too.
+        They must show most of its outlines, and these must have a planned size: shadows have outlines, too. Where the
+        cloud resolves its section and has that size as well, what others leave of its outlines suffices.
         """
         if any(_alike(candidate.cylinder, refused) for refused in self._refused):
             return False
         views = showing(_places(candidate.cylinder), self._views, FEW_VIEWS)
         fit = self._as_planned(self._refined(candidate, [], views, follow=False), [])
-        if fit is None or fit.support < CONVINCING or not is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill):
+        vouched = (
+            fit is not None
+            and is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill)
+            and (fit.support > CONVINCING or _agree(candidate, fit))
+        )
+        if not vouched:
             self._refused.append(candidate.cylinder)
-            return False
-        return True
+        return vouched
 
     def measure(self, candidates: Sequence[Candidate], trusted: Sequence[bool]) -> list[Measured]:
         """The candidates measured by their outlines.
@@ -198,6 +205,12 @@ def _alike(one: Cylinder, other: Cylinder) -> bool:
     same = max(np.linalg.norm(one.start - other.start), np.linalg.norm(one.end - other.end))
     turned = max(np.linalg.norm(one.start - other.end), np.linalg.norm(one.end - other.start))
     return bool(min(same, turned) < max(tolerance, 0.1 * other.length))
+
+
+def _agree(candidate: Candidate, fit: ContourFit) -> bool:
+    """Whether a cloud that resolves the section has the radius of the outlines."""
+    sigma = np.hypot(candidate.radius_sigma, fit.radius_sigma)
+    return _resolved(candidate) and bool(abs(fit.cylinder.radius - candidate.cylinder.radius) < AGREEMENT * sigma)
 
 
 def _contradict(candidate: Candidate, fit: ContourFit) -> bool:

@@ -270,7 +270,7 @@ def _covered(found: Ribbons, cylinder: Cylinder, view: View) -> NDArray[np.bool_
     offset = found.ends - ends[0]
     place = offset @ along
     aside = np.abs(offset @ np.array([-along[1], along[0]]))
-    reach = 1.1 * view.camera.fx * cylinder.radius / depth.min() + 2.0
+    reach = view.camera.fx * cylinder.radius / depth.min()
     return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
 
 

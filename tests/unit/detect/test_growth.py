@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,22 @@ def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[fl
     short = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], ContourConfig(), follow=False)
     assert short is not None
     assert short.cylinder.length < 0.2
+
+
+@pytest.mark.parametrize("length", [0.05, 0.06])
+@pytest.mark.parametrize("place", [0.0, 0.1, 0.2, 0.3])
+def test_a_piece_too_short_to_tell_its_direction_grows_in_the_one_that_its_edges_ahead_tell(
+    pipe_views: list[View], length: float, place: float
+) -> None:
+    random = np.random.default_rng(0)
+    views = [
+        replace(view, image=np.clip(view.image + 16.0 * random.standard_normal(view.image.shape), 0, 255).astype("u1"))
+        for view in pipe_views
+    ]
+    low = PIPE.start + place * PIPE.axis
+    fit = refine(Start(Cylinder(low, low + length * PIPE.axis, PIPE.radius), 0.002), views, [], ContourConfig())
+    assert fit is not None
+    assert fit.cylinder.length == pytest.approx(PIPE.length, abs=2.0 * END_TOLERANCE)
 
 
 def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[View], empty_views: list[View]) -> None:
