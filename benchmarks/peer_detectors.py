@@ -35,8 +35,7 @@ Cylinder = dict[str, Any]
 
 def cgal(points: Points) -> list[Cylinder]:
     """Efficient RANSAC of CGAL: once the large planes are off, planes and cylinders compete for the points."""
-    points = _without_planes(points)
-    shapes, labels = _cgal(points, FEWEST, planes=True, cylinders=True)
+    points, shapes, labels = _cgal(_without_planes(points), FEWEST, planes=True, cylinders=True)
     number = r"[-+0-9.e]+"
     found = []
     for index, text in enumerate(shapes):
@@ -87,8 +86,8 @@ def main(name: str, source: Path, target: Path) -> None:
     target.write_text(json.dumps({"cylinders": kept, "seconds": round(seconds, 1), "points": len(points)}) + "\n")
 
 
-def _cgal(points: Points, fewest: int, planes: bool, cylinders: bool) -> tuple[list[str], Any]:
-    """CGAL's Efficient RANSAC: each shape in its own words, and the shape of each point or -1."""
+def _cgal(points: Points, fewest: int, planes: bool, cylinders: bool) -> tuple[Points, list[str], Any]:
+    """CGAL's Efficient RANSAC: the points, which it sorts anew, each shape in its words, each point's shape or -1."""
     from CGAL.CGAL_Kernel import Point_3
     from CGAL.CGAL_Point_set_3 import Point_set_3
     from CGAL.CGAL_Point_set_processing_3 import pca_estimate_normals
@@ -102,12 +101,15 @@ def _cgal(points: Points, fewest: int, planes: bool, cylinders: bool) -> tuple[l
     shape = cloud.add_int_map("shape", -1)
     # Order: fewest points, distance, spacing of a shape's points, normals' cosine, chance to miss a larger shape.
     texts = efficient_RANSAC(cloud, shape, fewest, EPSILON, SPACING, 0.8, 1e-4, planes, False, cylinders, False, False)
-    return list(texts), np.fromiter((shape.get(index) for index in cloud.indices()), np.int64, len(points))
+    labels = np.fromiter((shape.get(index) for index in cloud.indices()), np.int64, len(points))
+    moved = np.array([(point.x(), point.y(), point.z()) for point in cloud.points()])
+    return moved, list(texts), labels
 
 
 def _without_planes(points: Points) -> Points:
     """The points that lie on no large plane."""
-    return points[_cgal(points, LARGE, planes=True, cylinders=False)[1] < 0]
+    points, _, labels = _cgal(points, LARGE, planes=True, cylinders=False)
+    return points[labels < 0]
 
 
 def _cylinder(centre: Any, axis: Any, radius: float, points: Points) -> Cylinder:
