@@ -16,7 +16,8 @@ from pipeprog_detect.extent import Run
 from pipeprog_detect.measured import Measured, is_known, is_stub
 from pipeprog_detect.outline import viewing_direction
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.ribbons import DEPTH_SIGMA, covers, laid, mean_centre, propose
+from pipeprog_detect.ribbons import DEPTH_SIGMA, propose
+from pipeprog_detect.sightline import covers, laid, mean_centre
 from pipeprog_detect.support import outline_support
 from pipeprog_detect.verify import Candidate, Evidence
 

@@ -8,8 +8,8 @@ import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.pipe import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE, WALL
 
-WALL_DEPTH = 0.12
 SAMPLES = 2
 
 
@@ -25,12 +25,12 @@ def _look_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _render(cylinder: Cylinder | None, pose: np.ndarray, camera: Camera, shadow_at: float, seed: int) -> np.ndarray:
-    """Grey image (H, W) uint8; the wall is the plane y = WALL_DEPTH, the shadow's edge on it lies at x = shadow_at."""
+    """Grey image (H, W) uint8; the wall is the plane y = WALL, the shadow's edge on it lies at x = shadow_at."""
     columns, rows = ((np.arange(size * SAMPLES) + 0.5) / SAMPLES - 0.5 for size in (camera.width, camera.height))
     u, v = np.meshgrid(columns, rows)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1) @ pose[:3, :3]
     centre = -pose[:3, :3].T @ pose[:3, 3]
-    on_wall = centre + rays * ((WALL_DEPTH - centre[1]) / rays[..., 1])[..., None]
+    on_wall = centre + rays * ((WALL - centre[1]) / rays[..., 1])[..., None]
     texture = np.random.default_rng(7)
     light = np.full(u.shape, 0.30)
     for frequency, phase in zip(texture.normal(0, 60, (8, 2)), texture.uniform(0, 6.28, 8), strict=True):
@@ -66,9 +66,6 @@ def _walk(cylinder: Cylinder | None, shadow_at: float, count: int = 8) -> list[V
         pose = _look_at(centre, np.array([0.3 * x, 0.0, 0.0]))
         views.append(View(index, _render(cylinder, pose, camera, shadow_at, index), camera, pose))
     return views
-
-
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,8 @@ from pipeprog_detect.background import Plane
 from pipeprog_detect.octree import Octree
 from pipeprog_detect.outline import camera_centre
 from pipeprog_detect.pipe import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE
 
-# The pipe of `pipe_views`, seen from y = -1.2.
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 NO_RIMS = (0.0, 0.0)
 TOLERANCE = 1e-3
 

@@ -12,9 +12,8 @@ from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.outline import frame
 from pipeprog_detect.pipe import Cylinder, View
 from pipeprog_detect.support import support
+from tests.unit.detect.pipe_and_wall import PIPE
 
-# The pipe of `pipe_views`.
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 UP = np.array([0.0, 0.0, 1.0])
 # One pixel is 3.5 mm here; the limb operator resolves a tenth of the blur.
 RADIUS_TOLERANCE = 0.35e-3

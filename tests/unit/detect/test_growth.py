@@ -11,9 +11,8 @@ from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.growth import grown, outline_evidence
 from pipeprog_detect.pipe import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE
 
-# The pipe of `pipe_views`.
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 END_TOLERANCE = 2e-3  # half a pixel
 STATIONS_TOLERANCE = 0.03  # outlines alone tell an end to two stations of 6 px
 

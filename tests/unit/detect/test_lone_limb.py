@@ -8,9 +8,9 @@ from pipeprog_detect.contour import Start, refine
 from pipeprog_detect.lone_limb import SeenArc, lone_limb, precision
 from pipeprog_detect.outline import frame, moved, viewing_direction
 from pipeprog_detect.pipe import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE
 
-# The pipe of `pipe_views`, and another that hides its outline towards +x from all of the walk.
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
+# Another pipe, which hides the outline of that of `pipe_views` towards +x from all of the walk.
 NEIGHBOUR = Cylinder(np.array([0.1, -0.08, -0.5]), np.array([0.08, -0.08, 0.5]), 0.09)
 SEEN = SeenArc(np.radians(105.0), 1e-3)
 

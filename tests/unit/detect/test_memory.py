@@ -12,8 +12,8 @@ from pipeprog_camera.camera import Camera
 from pipeprog_detect.keyframes import Keyframes
 from pipeprog_detect.memory import Memory
 from pipeprog_detect.pipe import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE
 
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 FAR = Cylinder(PIPE.start + 2.0, PIPE.end + 2.0, 0.04)
 
 

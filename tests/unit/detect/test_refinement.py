@@ -10,10 +10,9 @@ from pipeprog_detect.extent import Run
 from pipeprog_detect.pipe import Cylinder, View
 from pipeprog_detect.refinement import Jury
 from pipeprog_detect.verify import Candidate, Evidence
+from tests.unit.detect.pipe_and_wall import PIPE
 from tests.unit.detect.straight_ahead import looking_along_y
 
-# The pipe of `pipe_views`.
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 BILL = Bill((PipeClass("DN65", PIPE.radius, 3.0, (0.0, 0.0, 1.0), 4e-4),))
 
 

@@ -7,9 +7,8 @@ import pytest
 
 from pipeprog_detect.pipe import Cylinder, View
 from pipeprog_detect.rim import find_end
+from tests.unit.detect.pipe_and_wall import PIPE
 
-# The pipe of `pipe_views`.
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 # A third of a pixel at 1.2 m.
 END_TOLERANCE = 1.2e-3
 

@@ -8,9 +8,9 @@ import pytest
 from pipeprog_detect.outline import camera_centre
 from pipeprog_detect.pipe import Cylinder, FloatArray, View
 from pipeprog_detect.support import MIN_SUPPORT, SupportProfile, outline_support, own_outlines, support
+from tests.unit.detect.pipe_and_wall import PIPE
 
 BEHIND = 0.012  # [m]
-PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)  # as in pipe_views
 
 
 def ghost_of(pipe: Cylinder, views: list[View]) -> Cylinder:

@@ -1,0 +1,23 @@
+"""The pipe and the wall of `pipe_views`, as points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeprog_detect.pipe import Cylinder, FloatArray
+
+PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
+WALL = 0.12  # y [m]
+
+
+def wall_points() -> FloatArray:
+    x, z = np.meshgrid(np.arange(-0.8, 0.8, 0.005), np.arange(-0.5, 0.5, 0.005))
+    return np.stack([x.ravel(), np.full(x.size, WALL), z.ravel()], axis=1)
+
+
+def front_points(cylinder: Cylinder) -> FloatArray:
+    """The half of the barrel that faces -y."""
+    angle, along = np.meshgrid(np.linspace(-1.3, 1.3, 30), np.arange(0.0, cylinder.length, 0.004))
+    side = np.cross(cylinder.axis, [0.0, -1.0, 0.0])
+    radial = np.cos(angle)[..., None] * np.array([0.0, -1.0, 0.0]) + np.sin(angle)[..., None] * side
+    return (cylinder.start + along[..., None] * cylinder.axis + cylinder.radius * radial).reshape(-1, 3)
