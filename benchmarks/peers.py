@@ -39,7 +39,7 @@ PEERS = {
     "pyransac3d": "pyRANSAC-3D 0.7.0, repeated",
 }
 KEPT = ROOT / "out" / "peers"
-LIMIT = 600  # s of one peer on one cloud
+LIMIT = 300  # s of one peer on one cloud
 # A detection passes for a planned class within the larger of these of its radius; else it counts as no class's.
 RELATIVE, ABSOLUTE = 0.15, 0.004
 SOURCE = "other clouds of the same kind: 58 pipes, 5 M points, 3 mm noise; settings tuned on them by others"
