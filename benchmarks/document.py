@@ -45,6 +45,10 @@ HEADLINE = {"field": (5, 6, 7), "lab": (4,)}
 QUANTITIES = ("F", "radius RMSE [mm]", "radius RMSE of 8.6 mm [mm]", "length error [%]")
 
 NOTES = {
+    "ablations": (
+        "Starts from surveys at 85 % overlap. What the correction for eccentricity is worth shows in the scale. "
+        "Feedback and deblurring are for walks less even than these: `motions` and `deblur` below."
+    ),
     "board_views": (
         "50 random choices of so many views for each site. The paper says that the correction for eccentricity halves "
         "the error and that five views suffice; what is seen here:"

@@ -151,7 +151,7 @@ def refine(
         refined = _fine(moved(cylinder, basis, step), scene, blur, prior, step)
     if refined is not None and follow:
         refined, basis = _followed(refined, scene, blur, prior, held)
-    if refined is None or refined.share < MIN_SUPPORT or refined.cylinder.radius <= 0:
+    if refined is None or refined.share < MIN_SUPPORT:
         return None
     ends: list[End | None] = [None, None]
     if follow:
@@ -243,6 +243,8 @@ def _swung(
         return None
     at = stations(longer, views, basis, CHUNK)
     at = _some(at.select(visible(longer, others, views, at)))
+    if not len(at):
+        return None
     steps = vote(views, at, np.append(reach, RADIUS_HELD), reach.max() * float(at.gain.max()), CHUNK // 2)
     swung = _fine(moved(longer, basis, steps[0]), scene, blur, held, np.zeros(5))
     if swung is None:
@@ -259,12 +261,14 @@ def _fine(
     prior: FloatArray,
     so_far: FloatArray,
 ) -> _Refined | None:
-    """A few passes of least squares, the edges sought anew in each; None where too little is seen."""
+    """A few passes of least squares, the edges sought anew in each; None where that leaves no cylinder."""
     views, _, basis = scene
     view_offset: FloatArray = np.zeros(len(views))
     step: FloatArray = np.zeros(5)
     for _ in range(FINE_PASSES):
         current = moved(cylinder, basis, step)
+        if current.radius <= 0:
+            return None
         at, edges = outline_edges(current, *scene, view_offset, _reach(current, views, FINE_REACH), blur, CHUNK)
         if len(at) < MIN_STATIONS:
             return None
@@ -272,7 +276,8 @@ def _fine(
         step = step + solution.step
         view_offset = solution.view_offset
     share = support_profile(at, hits(at, _moved_by(edges, at, solution), view_offset)).share
-    return _Refined(moved(cylinder, basis, step), step, solution, share, at, edges)
+    found = moved(cylinder, basis, step)
+    return _Refined(found, step, solution, share, at, edges) if found.radius > 0 else None
 
 
 def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:

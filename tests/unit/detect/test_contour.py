@@ -102,3 +102,17 @@ def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:
     fit = refine(Start(PIPE, 0.002), pipe_views, [screen], CONFIG)
     assert fit is not None
     assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=2.0 * RADIUS_TOLERANCE)
+
+
+@pytest.mark.parametrize("radius_known", [True, False])
+@pytest.mark.parametrize("aside", [0.0, 0.02, 0.05, 0.08])
+def test_what_is_thinner_than_its_edges_can_tell_is_measured_as_something_or_not_at_all(
+    empty_views: list[View], pipe_views: list[View], radius_known: bool, aside: float
+) -> None:
+    """Edges of texture may pull a thin cylinder's radius below zero."""
+    place = np.array([aside, 0.0, 0.1])
+    for views in (empty_views, pipe_views):
+        for radius in (0.3e-3, 0.6e-3, 1e-3):
+            thread = Cylinder(PIPE.start + place, PIPE.end + place - [0.0, 0.0, 0.2], radius)
+            fit = refine(Start(thread, radius, radius_known, 0.03), views, [], ContourConfig(), [radius])
+            assert fit is None or fit.cylinder.radius > 0
