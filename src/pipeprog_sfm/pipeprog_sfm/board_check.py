@@ -96,5 +96,6 @@ def contradiction(place: PlacedBoard, measured: BoardPlacement, config: BoardCon
     listed = ", ".join(f"{number + 1}: {offset:.2f} mm" for number, offset in enumerate(offsets) if known[number])
     return (
         f"board {place.board.name} contradicts its file (circles off by {listed}; they should be right to "
-        f"{1000 * config.tolerance:g} mm): measure its centres again, or check that it is flat and the file is its own"
+        f"{1000 * config.tolerance:g} mm): measure its centres again, check that it is flat and the file is its own, "
+        "or walk slower past it if the camera has a rolling shutter"
     )
