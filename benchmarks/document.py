@@ -73,7 +73,7 @@ NOTES = {
     "experiment_table_5": "Precision and recall of the paper as printed; they look swapped, see above.",
     "peers": (
         "Scanned clouds of generated sites, the same scorer for all. The peers' random choices are not seeded by their "
-        "interfaces: their figures move a little from run to run."
+        "interfaces: their figures move a little from run to run. Without CPU seconds: no answer within five minutes."
     ),
 }
 PICTURES = {
