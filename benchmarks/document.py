@@ -145,7 +145,7 @@ def _headline(results: dict[str, Survey]) -> str:
                 where = f"real {layout}, 4K" if who == "paper's figure" else f"generated {layout}s, {size}"
                 rows.append([who, where, *map(_cell, cells)])
     for row in results.get("peers", {}).get("rows", ()):
-        if row["cloud"].startswith("field"):
+        if row["cloud"].startswith("field") and row["CPU s"] is not None:
             cells = [row["F"], row["radius RMSE [mm]"], None, None]
             rows.append([f"{row['detector']}, detection alone", f"scanned {row['cloud']}", *map(_cell, cells)])
     return _table(["", "on", *QUANTITIES], rows)
