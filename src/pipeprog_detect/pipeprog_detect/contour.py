@@ -10,12 +10,7 @@ from numpy.typing import NDArray
 
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.consensus import distinct, vote
-from pipeprog_detect.edges import (
-    LimbEdges,
-    estimate_blur,
-    outline_edges,
-    sideways,
-)
+from pipeprog_detect.edges import LimbEdges, estimate_blur, outline_edges, sideways
 from pipeprog_detect.growth import AHEAD, FARTHEST, LEAST, TOLERANCE, grown
 from pipeprog_detect.lone_limb import SeenArc, lone_limb, precision, shows_both
 from pipeprog_detect.outline import Stations, camera_centre, frame, moved, stations, viewing_direction, visible
