@@ -43,9 +43,9 @@ from pipeprog_detect.pipe import Cloud, Pipe
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.selector import FrameSelector
+from pipeprog_sfm.boards.board_file import load_targets
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.reconstruction import Reconstruction
-from pipeprog_sfm.target_file import load_targets
 
 FloatArray = NDArray[np.float64]
 Figures = dict[str, Any]

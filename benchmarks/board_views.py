@@ -30,10 +30,10 @@ from benchmarks.survey import RESULTS, RUNS, survey
 from pipeprog_bringup.bag import Bag
 from pipeprog_bringup.results import read_trajectory
 from pipeprog_bringup.score import score_files
-from pipeprog_sfm.board_tracker import BoardTracker
+from pipeprog_sfm.boards.board_file import load_targets
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.scale import NoScaleError
-from pipeprog_sfm.target_file import load_targets
+from pipeprog_sfm.metric.metric_tracker import BoardTracker
+from pipeprog_sfm.metric.scale import NoScaleError
 
 CHOICES = 50  # as in the paper
 VIEWS = range(2, 36)  # as in the paper

@@ -25,9 +25,9 @@ from pipeprog_bringup.bag import Bag
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import DeblurConfig, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
-from pipeprog_sfm.dense import EncodedImage
-from pipeprog_sfm.features import Features
-from pipeprog_sfm.mapper import Mapper
+from pipeprog_sfm.dense.dense_mapper import EncodedImage
+from pipeprog_sfm.sparse.features import Features
+from pipeprog_sfm.sparse.mapper import Mapper
 
 EXPOSURES_MS = (8, 16, 32)
 OPTIONS = ("--size=480p", "--seconds=2.6", "--allow-hidden")

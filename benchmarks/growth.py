@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
-from pipeprog_sfm.features import Features, root_sift
-from pipeprog_sfm.mapper import Mapper
+from pipeprog_sfm.sparse.features import Features, root_sift
+from pipeprog_sfm.sparse.mapper import Mapper
 
 RESULTS = Path(__file__).parent / "results" / "growth.json"
 CAMERA = Camera(1280, 720, 900.0, 900.0, 639.5, 359.5)

@@ -54,10 +54,10 @@ def _shifted(project: Any) -> Any:
 
 HARMS = {
     "eccentricity of the circles left in": Harm(
-        "pipeprog_sfm.placed_board.circle_centre_images", _centres_as_imaged, "sfm"
+        "pipeprog_sfm.boards.placed_board.circle_centre_images", _centres_as_imaged, "sfm"
     ),
     "half a pixel between COLMAP and ROS": Harm(
-        "pipeprog_sfm.colmap._pixels", lambda _: lambda pixels: pixels.astype(float), "sfm"
+        "pipeprog_sfm.sparse.colmap._pixels", lambda _: lambda pixels: pixels.astype(float), "sfm"
     ),
     "half a pixel in the projection of rims": Harm("pipeprog_detect.rim.project", _shifted, "detect"),
     "no sector of the normals in the detector": Harm(

@@ -21,9 +21,9 @@ from benchmarks.recordings import made, named
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
 from pipeprog_bringup.score import read_truth
+from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.geometry import similarity
-from pipeprog_sfm.mapper import Mapper
+from pipeprog_sfm.sparse.mapper import Mapper
 
 RECORDING = "lab:31:fps=30:seconds=8:allow-hidden"
 

@@ -29,7 +29,7 @@ from pipeprog_frames.ring import Frame, FrameFile
 from pipeprog_frames.selector import Decision
 from pipeprog_frames.stream import Stream
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.mapper import Mapper
+from pipeprog_sfm.sparse.mapper import Mapper
 
 sys.path.insert(0, str(ROOT / "bags"))
 from sitegen.lab import build_lab

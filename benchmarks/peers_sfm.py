@@ -28,9 +28,9 @@ from benchmarks.scale_sigma import decoded
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
 from pipeprog_camera.camera import Camera
+from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import MapperConfig, SfmConfig
-from pipeprog_sfm.geometry import similarity
-from pipeprog_sfm.mapper import Mapper
+from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.warm_up import warm_up
 
 FloatArray = NDArray[np.float64]

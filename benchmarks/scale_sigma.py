@@ -23,12 +23,12 @@ from sensor_msgs.msg import CompressedImage
 from benchmarks.recordings import Recording, made, site
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
-from pipeprog_sfm.board_tracker import BoardTracker
+from pipeprog_sfm.boards.board_file import load_targets
+from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.geometry import similarity
-from pipeprog_sfm.mapper import Mapper
-from pipeprog_sfm.scale import ScaleEstimate
-from pipeprog_sfm.target_file import load_targets
+from pipeprog_sfm.metric.metric_tracker import BoardTracker
+from pipeprog_sfm.metric.scale import ScaleEstimate
+from pipeprog_sfm.sparse.mapper import Mapper
 
 FIRST_SEED = 201
 OPTIONS = ("--size=480p", "--seconds=5", "--fps=3", "--allow-hidden")

@@ -150,8 +150,8 @@ def board(
 ) -> None:
     """Write target boards and marks to print at true size, each with a ruler to check the print."""
     from pipeprog_bringup.output import output_file
-    from pipeprog_sfm.board_print import board_pdf
-    from pipeprog_sfm.target_file import load_targets
+    from pipeprog_sfm.boards.board_file import load_targets
+    from pipeprog_sfm.boards.board_print import board_pdf
 
     targets = load_targets(boards)
     pages = [*targets.boards, *(disc for pair in targets.marks for disc in pair.discs)]

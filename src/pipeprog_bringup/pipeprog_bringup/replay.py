@@ -25,7 +25,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.bill import load_bill
 from pipeprog_detect.classify import ClassProgress
 from pipeprog_detect.pipe import Pipe
-from pipeprog_sfm.target_file import Targets, load_targets
+from pipeprog_sfm.boards.board_file import Targets, load_targets
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.dense import EncodedImage
-from pipeprog_sfm.features import extract
-from pipeprog_sfm.mapper import Mapper
+from pipeprog_sfm.dense.dense_mapper import EncodedImage
+from pipeprog_sfm.sparse.features import extract
+from pipeprog_sfm.sparse.mapper import Mapper
 
 FloatArray = NDArray[np.float64]
 

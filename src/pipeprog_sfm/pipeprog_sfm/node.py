@@ -26,12 +26,12 @@ from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
+from pipeprog_sfm.boards.board_file import Targets, load_targets
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.journal import Journal
-from pipeprog_sfm.motion import Acceleration, Motion, Transform
-from pipeprog_sfm.overlap import FrameTie
+from pipeprog_sfm.metric.transform_tree import Acceleration, Motion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
-from pipeprog_sfm.target_file import Targets, load_targets
+from pipeprog_sfm.sparse.overlap import FrameTie
 from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Ready, Retire, Retired, serve
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.board_tracker import BoardTracker
-from pipeprog_sfm.colmap import ModelView, write_model
+from pipeprog_sfm.boards.board_file import Targets
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
-from pipeprog_sfm.dense import DenseMapper, EncodedImage, centre
-from pipeprog_sfm.fusion import FusedCloud
-from pipeprog_sfm.mapper import GROWTH, KeyframeReport, Mapper
-from pipeprog_sfm.motion import Motion
-from pipeprog_sfm.overlap import FrameTie
-from pipeprog_sfm.scale import NoScaleError, ScaleEstimate
-from pipeprog_sfm.target_file import Targets
+from pipeprog_sfm.dense.dense_mapper import DenseMapper, EncodedImage, centre
+from pipeprog_sfm.dense.depth_fusion import FusedCloud
+from pipeprog_sfm.metric.metric_tracker import BoardTracker
+from pipeprog_sfm.metric.scale import NoScaleError, ScaleEstimate
+from pipeprog_sfm.metric.transform_tree import Motion
+from pipeprog_sfm.sparse.colmap import ModelView, write_model
+from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
+from pipeprog_sfm.sparse.overlap import FrameTie
 
 FloatArray = NDArray[np.float64]
 

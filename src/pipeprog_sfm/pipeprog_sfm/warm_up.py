@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from pipeprog_camera.camera import Camera
+from pipeprog_sfm.boards.board_file import Targets
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.fusion import fuse
+from pipeprog_sfm.dense.depth_fusion import fuse
+from pipeprog_sfm.dense.stereo import StereoImage, depth_map
 from pipeprog_sfm.reconstruction import Reconstruction
-from pipeprog_sfm.stereo import StereoImage, depth_map
-from pipeprog_sfm.target_file import Targets
 
 SIZE = (320, 240)
 DEPTHS = (0.7, 1.5)

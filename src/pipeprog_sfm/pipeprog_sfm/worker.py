@@ -11,11 +11,11 @@ from pathlib import Path
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_sfm.boards.board_file import Targets
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.motion import Motion
-from pipeprog_sfm.overlap import FrameTie
+from pipeprog_sfm.metric.transform_tree import Motion
 from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
-from pipeprog_sfm.target_file import Targets
+from pipeprog_sfm.sparse.overlap import FrameTie
 from pipeprog_sfm.warm_up import warm_up
 
 IDLE_SECONDS = 1.0  # without a command, after which a map goes out early: nobody knows when the next keyframe comes

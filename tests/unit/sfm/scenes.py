@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.adjustment import Bundle, rotation_from_vector
-from pipeprog_sfm.features import Features, root_sift
-from pipeprog_sfm.initialisation import model_of_pair
-from pipeprog_sfm.keyframe import Keyframe
-from pipeprog_sfm.matching import match
-from pipeprog_sfm.model import SparseModel
+from pipeprog_sfm.sparse.bundle_adjustment import Bundle, rotation_from_vector
+from pipeprog_sfm.sparse.features import Features, root_sift
+from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.sparse.matching import match
+from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.sparse.two_view import model_of_pair
 
 VIEWS, POINTS = 6, 150
 FOCAL = 900.0

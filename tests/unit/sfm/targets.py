@@ -7,9 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.board import Board
-from pipeprog_sfm.conic import project_circles
-from pipeprog_sfm.ellipse import TargetEllipses
+from pipeprog_sfm.boards.board import Board
+from pipeprog_sfm.boards.conic import project_circles
+from pipeprog_sfm.boards.ellipses import TargetEllipses
 
 CAMERA = Camera(640, 400, 500.0, 500.0, 319.5, 199.5)
 PLANE = np.array([[-240, 150], [240, 150], [0, 0], [-240, -150], [240, -150]]) / 1000

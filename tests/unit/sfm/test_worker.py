@@ -8,8 +8,8 @@ import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm import worker
+from pipeprog_sfm.boards.board_file import Targets
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.target_file import Targets
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 

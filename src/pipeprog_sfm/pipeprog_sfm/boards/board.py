@@ -1,0 +1,98 @@
+"""Target boards, what an image shows of one, and which of them look the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_sfm.boards.conic import FloatArray
+
+LEAST_CIRCLES = 3  # circles that identify a board: fewer agree by chance
+SAME_PLACE = 0.1  # of a circle's radius: circles of two layouts closer than that are the same circle
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat dark board with bright circles.
+
+    Attributes:
+        name: unique name.
+        circle_radius: radius of every circle, m.
+        centres: (N, 3) float64 circle centres in the board's frame, m: z = 0, x right and y up seen from the front.
+    """
+
+    name: str
+    circle_radius: float
+    centres: FloatArray
+
+    @property
+    def spread(self) -> float:
+        """Root of the summed squared distances of the circles from their mean, m: the lever that a scale rests on."""
+        return float(np.linalg.norm(self.centres - self.centres.mean(0)))
+
+
+@dataclass(frozen=True)
+class BoardObservation:
+    """Circles of one board in one image; pixels of the ideal pinhole camera.
+
+    Attributes:
+        board: name of the board (of the first one where several in the file have the same layout).
+        indices: (K,) int, rows of Board.centres.
+        centres: (K, 2) images of the circles' centres, px: the ellipses' centres freed from eccentricity.
+        ellipse_centres: (K, 2) centres of the ellipses, px.
+        conics: (K, 3, 3) the ellipses as conics.
+        sigma: standard deviation of one coordinate of a centre, px, from the scatter of the edge points.
+        camera_from_board: (4, 4) pose seen from this image alone, m.
+    """
+
+    board: str
+    indices: NDArray[np.intp]
+    centres: FloatArray
+    ellipse_centres: FloatArray
+    conics: FloatArray
+    sigma: float
+    camera_from_board: FloatArray
+
+
+def symmetries(board: Board) -> NDArray[np.intp]:
+    """(S, N) orders of the circles that a turn of the board in its plane cannot tell from the given one (row 0).
+
+    Mirrored orders are no symmetry: a board is seen from its front.
+    """
+    return _turns_onto(board, board)
+
+
+def layouts(boards: Sequence[Board]) -> list[list[Board]]:
+    """Boards grouped by layout: images alone cannot tell the members of one group apart."""
+    groups: list[list[Board]] = []
+    for board in boards:
+        for group in groups:
+            if len(_turns_onto(group[0], board)):
+                group.append(board)
+                break
+        else:
+            groups.append([board])
+    return groups
+
+
+def _turns_onto(board: Board, other: Board) -> NDArray[np.intp]:
+    """(S, N) orders `o` so that other.centres[o] is board.centres turned in the plane and shifted."""
+    orders: list[NDArray[np.intp]] = []
+    if len(board.centres) == len(other.centres) and abs(board.circle_radius / other.circle_radius - 1) < SAME_PLACE:
+        limit = SAME_PLACE * board.circle_radius
+        plane, target = (one.centres[:, :2] - one.centres[:, :2].mean(0) for one in (board, other))
+        points, goals = (xy[:, 0] + 1j * xy[:, 1] for xy in (plane, target))
+        anchor = np.abs(points).argmax()
+        for goal in goals:
+            if abs(abs(goal) - abs(points[anchor])) > limit:
+                continue
+            turned = points * (goal / abs(goal)) / (points[anchor] / abs(points[anchor]))
+            gaps = np.abs(turned[:, None] - goals[None])
+            order = gaps.argmin(1)
+            if gaps.min(1).max() <= limit and len(set(order)) == len(order):
+                orders.append(order)
+    orders.sort(key=lambda order: int((order != np.arange(len(order))).sum()))
+    return np.array(orders, dtype=np.intp).reshape(-1, len(board.centres))

@@ -1,0 +1,209 @@
+"""The file of target boards: what hangs on the site, and what was measured between it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pipeprog_camera.errors import InputError
+from pipeprog_sfm.boards.board import LEAST_CIRCLES, Board, symmetries
+
+
+@dataclass(frozen=True)
+class Distance:
+    """A measured distance between the centres of two circles.
+
+    Attributes:
+        name: for people.
+        ends: name of the board and row of Board.centres, twice.
+        length: m.
+        sigma: standard deviation of `length`, m.
+    """
+
+    name: str
+    ends: tuple[tuple[str, int], tuple[str, int]]
+    length: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class MarkPair:
+    """Two discs of one size.
+
+    Attributes:
+        name: for people.
+        circle_radius: of both discs, m.
+        length: distance between their centres, m.
+        sigma: standard deviation of `length`, m.
+    """
+
+    name: str
+    circle_radius: float
+    length: float
+    sigma: float
+
+    @property
+    def distance(self) -> Distance:
+        """Between the circles of `discs`."""
+        one, two = self.discs
+        return Distance(self.name, ((one.name, 0), (two.name, 0)), self.length, self.sigma)
+
+    @property
+    def discs(self) -> tuple[Board, Board]:
+        """Each disc as a board of one circle."""
+        one, two = (Board(f"{self.name}/{end}", self.circle_radius, np.zeros((1, 3))) for end in (1, 2))
+        return one, two
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Everything with a known size.
+
+    Attributes:
+        boards: flat boards with circles.
+        distances: measured between circles of boards.
+        marks: pairs of single discs.
+    """
+
+    boards: Sequence[Board] = ()
+    distances: Sequence[Distance] = ()
+    marks: Sequence[MarkPair] = ()
+
+
+def load_targets(path: str | Path) -> Targets:
+    """What a BOARD.yaml file says; at least one board or pair of marks.
+
+    boards: [{name, circle_radius_mm, centres_mm: [[x, y], ...]}]
+    distances: [{from: A/1, to: B/3, distance_mm, sigma_mm}], where `A/1` is the first circle of board A
+    marks: [{circle_radius_mm, distance_mm, sigma_mm}]
+
+    Raises:
+        InputError: the file cannot be read, a key is missing or unknown, text stands where a number belongs, a length
+            is not positive, a board has fewer than three circles, circles that overlap or lie on one line, a layout
+            that looks the same turned by 120 degrees or less, or a name that is taken, a distance ends at a circle
+            that is not in the file, or the marks of a pair overlap.
+    """
+    content = _content(path)
+    entries = {key: content.get(key, []) for key in ("boards", "distances", "marks")}
+    for key, rows in entries.items():
+        if not isinstance(rows, list):
+            raise InputError(f"{path}: '{key}' must be a list")
+    if not entries["boards"] and not entries["marks"]:
+        raise InputError(f"{path}: 'boards' must be a list with at least one board (or give a pair of 'marks')")
+    boards: list[Board] = []
+    for number, entry in enumerate(entries["boards"], 1):
+        board = _board(entry, f"{path}: board {number}")
+        if board.name in [other.name for other in boards]:
+            raise InputError(f"{path}: the name '{board.name}' is given to two boards: names must be unique")
+        boards.append(board)
+    distances = [_distance(entry, f"{path}: distance {k}", boards) for k, entry in enumerate(entries["distances"], 1)]
+    marks = [_marks(entry, f"{path}: marks {k}", f"marks {k}") for k, entry in enumerate(entries["marks"], 1)]
+    return Targets(tuple(boards), tuple(distances), tuple(marks))
+
+
+def _distance(value: Any, where: str, boards: Sequence[Board]) -> Distance:
+    entry = _entry(value, ("from", "to", "distance_mm", "sigma_mm"), where)
+    ends = []
+    if not boards:
+        raise InputError(f"{where}: distances lie between circles of boards, and the file has none: write it as marks")
+    for key in ("from", "to"):
+        name, _, number = str(entry[key]).rpartition("/")
+        count = next((len(board.centres) for board in boards if board.name == name), 0)
+        if not number.isdecimal() or not 1 <= int(number) <= count:
+            raise InputError(
+                f"{where}: '{key}: {entry[key]}' is no circle of the file: write BOARD/NUMBER, such as "
+                f"{boards[0].name}/1 for the first circle of board {boards[0].name}"
+            )
+        ends.append((name, int(number) - 1))
+    if ends[0] == ends[1]:
+        raise InputError(f"{where}: both ends are {entry['from']}")
+    length, sigma = _length(entry, where)
+    return Distance(f"{entry['from']} to {entry['to']}", (ends[0], ends[1]), length, sigma)
+
+
+def _marks(value: Any, where: str, name: str) -> MarkPair:
+    entry = _entry(value, ("circle_radius_mm", "distance_mm", "sigma_mm"), where)
+    radius = _circle_radius(entry, where)
+    length, sigma = _length(entry, where)
+    if length <= 2 * radius:
+        raise InputError(f"{where}: distance_mm = {1000 * length:g} is within the marks: measure between centres")
+    return MarkPair(name, radius, length, sigma)
+
+
+def _length(entry: Mapping[str, Any], where: str) -> tuple[float, float]:
+    """A measured distance and its standard deviation, m."""
+    length, sigma = (_number(entry[key], f"{where}: {key}") for key in ("distance_mm", "sigma_mm"))
+    if length <= 0 or sigma <= 0:
+        raise InputError(f"{where}: distance_mm and sigma_mm must be above zero")
+    return length / 1000, sigma / 1000
+
+
+def _circle_radius(entry: Mapping[str, Any], where: str) -> float:
+    """m"""
+    radius = _number(entry["circle_radius_mm"], f"{where}: circle_radius_mm")
+    if radius < 1.0:
+        raise InputError(f"{where}: circle_radius_mm = {radius:g} is too small: give millimetres, 1 or more")
+    return radius / 1000
+
+
+def _content(path: str | Path) -> Mapping[str, Any]:
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the board file cannot be read ({error})") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
+    keys = () if isinstance(content, dict) and "marks" in content else ("boards",)
+    return _entry(content, keys, str(path), optional=("boards", "distances", "marks"))
+
+
+def _entry(value: Any, keys: Sequence[str], where: str, optional: Sequence[str] = ()) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: expected the keys {', '.join(keys)}, found {value!r}")
+    known = (*keys, *optional)
+    for key in value:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, 1, 0.0)[0]
+            raise InputError(f"{where}: unknown key '{key}', did you mean '{near}'?")
+    for key in keys:
+        if key not in value:
+            raise InputError(f"{where}: the key '{key}' is missing")
+    return value
+
+
+def _board(value: Any, where: str) -> Board:
+    entry = _entry(value, ("name", "circle_radius_mm", "centres_mm"), where)
+    name = str(entry["name"])
+    where = f"{where} ('{name}')"
+    radius = 1000 * _circle_radius(entry, where)
+    rows = entry["centres_mm"]
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 2 for row in rows):
+        raise InputError(f"{where}: centres_mm must be a list of [x, y] pairs in millimetres")
+    if len(rows) < LEAST_CIRCLES:
+        raise InputError(f"{where}: {len(rows)} circles, but a board needs {LEAST_CIRCLES} or more")
+    flat = np.array([[_number(number, f"{where}: centres_mm") for number in row] for row in rows])
+    apart = np.linalg.norm(flat[:, None] - flat[None], axis=-1) + np.diag(np.full(len(flat), np.inf))
+    if apart.min() <= 2 * radius:
+        first, second = np.unravel_index(apart.argmin(), apart.shape)
+        raise InputError(f"{where}: circles {first + 1} and {second + 1} overlap ({apart.min():g} mm apart)")
+    if np.linalg.svd(flat - flat.mean(0), compute_uv=False)[1] < 2 * radius:
+        raise InputError(f"{where}: the circles lie on one line: move one aside, so that the board has a plane")
+    board = Board(name, radius / 1000, np.c_[flat, np.zeros(len(flat))] / 1000)
+    turns = len(symmetries(board))
+    if turns > 2:
+        raise InputError(
+            f"{where}: the layout looks the same {turns} ways round, and its circles cannot be told apart: move one"
+        )
+    return board
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise InputError(f"{where}: {value!r} is not a number")
+    return float(value)

@@ -1,0 +1,235 @@
+"""The dense cloud of a stream of keyframes: which of them get a depth map, made and merged beside the mapper."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.config import FusionConfig, StereoConfig
+from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
+from pipeprog_sfm.dense.stereo import DepthMap, StereoImage, choose_pairs, depth_map, working_image
+
+FloatArray = NDArray[np.float64]
+
+LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
+SUBMITTED = 2  # depth maps that stand before a fusion in the queue: more would only make the map wait
+IMAGE_CACHE = 12  # decoded keyframes at working resolution: a depth map's neighbours are mostly the last few
+NICENESS = 5  # a third of the mapper's share where they compete: its poses are waited for, the cloud is not
+MIN_POINTS = 10  # of a keyframe, to know the range of its depths
+SAMPLE = 200  # of them, to know what other keyframes see of the same
+SAME_SIDE = np.radians(8.0)  # of a surface: farther round (0.14 of the depth), a view is a witness of its own
+SAME_SCALE = 1.5  # of an image: from nearer, more is to be seen
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """A keyframe as it came: JPEG or PNG bytes, and its calibration."""
+
+    data: bytes
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class _Depth:
+    map: DepthMap
+    baselines: dict[int, float]  # to the neighbours that it was made with, in model units of that time
+
+
+class DenseMapper:
+    """Depth maps and their fusion, in one thread of low priority beside the mapper's.
+
+    A keyframe gets a depth map unless another one shows nearly the same: what is held grows with the map, not with the
+    time spent in it. Depth maps are made in the order of the calls with the poses of the call, so that the result does
+    not depend on timing.
+    """
+
+    def __init__(self, stereo: StereoConfig, fusion: FusionConfig) -> None:
+        self._stereo_config, self._fusion_config = stereo, fusion
+        # On a straight walk a point is in sight of 1 / (1 - overlap) depth maps, four times as many as must agree on
+        # it: to the others it may be hidden, slanting, blurred, or too thin to be matched.
+        self._overlap = 1.0 - 1.0 / (4 * fusion.min_views)
+        self._image = lru_cache(maxsize=IMAGE_CACHE)(_decode)
+        self._depths: dict[int, Future[_Depth]] = {}
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._submitted: deque[Future[None]] = deque()
+        self._covered: dict[int, int] = {}  # keyframes without a depth map, and the one that shows the same
+        self._refused: dict[int, int] = {}  # keyframes without neighbours to match, and the size of the map then
+        self._thread = ThreadPoolExecutor(max_workers=1, initializer=_be_nice)
+        self._fusion = Fusion(fusion)  # from here on the thread's own
+        self._fused: dict[int, FloatArray] = {}
+
+    def __len__(self) -> int:
+        return len(self._depths)
+
+    def update(
+        self,
+        poses: Mapping[int, FloatArray],
+        images: Mapping[int, EncodedImage],
+        points: Callable[[int], FloatArray],
+        complete: bool,
+    ) -> None:
+        """Starts depth maps of the keyframes that have come, unless others show the same.
+
+        Args:
+            poses: (4, 4) camera_from_model by stamp.
+            images: the keyframes by stamp.
+            points: the (K, 3) points in the model that a keyframe sees.
+            complete: no keyframe comes any more, so that the last ones need not wait for their neighbours.
+        """
+        stamps = sorted(poses)
+        for stamp in stamps if complete else stamps[:-LOOKAHEAD]:
+            grown = len(poses) > 1.1 * self._refused.get(stamp, 0) + 2
+            if stamp not in self._depths and stamp not in self._covered and (grown or complete):
+                self._consider(stamp, poses, images, points(stamp))
+        self._submit(all_of_them=complete)
+
+    def retire(self, stamps: Collection[int]) -> None:
+        """Gives up depth maps; what they showed is left to others again."""
+        for stamp in stamps:
+            self._refused.pop(stamp, None)
+            self._covered.pop(stamp, None)
+            self._depths.pop(stamp, None)
+        for stamp in [stamp for stamp, other in self._covered.items() if other in stamps]:
+            del self._covered[stamp]
+
+    def fuse(
+        self,
+        camera_from_map: Mapping[int, FloatArray],
+        camera_from_model: Mapping[int, FloatArray],
+        scale: float,
+        complete: bool,
+    ) -> Future[FusedCloud]:
+        """The cloud for rigid poses in metres, `scale` metres per unit of the model.
+
+        If complete, it is made anew from all depth maps; else what is there is added to the last one, unless the poses
+        have moved by more than a voxel.
+        """
+        self._submit(all_of_them=complete)
+        maps = {}
+        for stamp, pose in camera_from_map.items():
+            future = self._depths.get(stamp)
+            if future is not None and (complete or future.done()):
+                maps[stamp] = (future, pose)
+        return self._thread.submit(self._fuse, maps, dict(camera_from_model), scale, complete)
+
+    def _consider(
+        self, stamp: int, poses: Mapping[int, FloatArray], images: Mapping[int, EncodedImage], points: FloatArray
+    ) -> None:
+        pose = poses[stamp]
+        depth = points @ pose[2, :3] + pose[2, 3]
+        points, depth = points[depth > 0], depth[depth > 0]
+        if len(depth) < MIN_POINTS:
+            self._refused[stamp] = len(poses)
+            return
+        sample = points[:: max(len(points) // SAMPLE, 1)]
+        mapped = [other for other in self._depths if other in poses]
+        seen = overlap(sample, pose, [poses[other] for other in mapped], images[stamp].camera)
+        if len(seen) and seen.max() > self._overlap:
+            self._covered[stamp] = mapped[int(seen.argmax())]
+            return
+        near, middle, far = np.percentile(depth, [1, 50, 99])
+        pairs = choose_pairs(stamp, poses, float(middle), self._stereo_config)
+        if not pairs:
+            self._refused[stamp] = len(poses)
+            return
+        # Surfaces without features lie beyond the sparse points' range as often as not.
+        depth_range = (0.7 * float(near), 1.5 * float(far))
+        views = [(other, images[other], poses[other]) for other in [stamp, *pairs]]
+        future: Future[_Depth] = Future()
+        self._depths[stamp] = future
+
+        def make() -> None:
+            try:
+                future.set_result(self._depth(views, depth_range))
+            except BaseException as error:
+                future.set_exception(error)
+
+        self._waiting.append(make)
+
+    def _submit(self, all_of_them: bool) -> None:
+        while self._submitted and self._submitted[0].done():
+            self._submitted.popleft()
+        while self._waiting and (all_of_them or len(self._submitted) < SUBMITTED):
+            self._submitted.append(self._thread.submit(self._waiting.popleft()))
+
+    def _depth(self, views: list[tuple[int, EncodedImage, FloatArray]], depth_range: tuple[float, float]) -> _Depth:
+        width = self._stereo_config.width
+        images = [StereoImage(stamp, *self._image(image, width), pose) for stamp, image, pose in views]
+        reference, neighbours = images[0], images[1:]
+        result = depth_map(reference, neighbours, depth_range, self._stereo_config)
+        pose = reference.camera_from_world
+        return _Depth(result, {other.stamp: distance(pose, other.camera_from_world) for other in neighbours})
+
+    def _fuse(
+        self,
+        maps: Mapping[int, tuple[Future[_Depth], FloatArray]],
+        camera_from_model: Mapping[int, FloatArray],
+        scale: float,
+        complete: bool,
+    ) -> FusedCloud:
+        poses = {stamp: pose for stamp, (_, pose) in maps.items()}
+        moved = [distance(poses[stamp], pose) for stamp, pose in self._fused.items() if stamp in poses]
+        if complete or max(moved, default=0.0) > self._fusion_config.voxel:
+            self._fusion, self._fused = Fusion(self._fusion_config), {}
+        for stamp, (future, pose) in maps.items():
+            if stamp in self._fused:
+                continue
+            depth = future.result()
+            left = [other for other in depth.baselines if other in camera_from_model]
+            if not left:
+                continue
+            # The model's unit drifts with every adjustment; the baselines tell by how much.
+            now = sum(distance(camera_from_model[stamp], camera_from_model[other]) for other in left)
+            drift = now / sum(depth.baselines[other] for other in left)
+            self._fusion.add(depth.map, pose, scale * drift)
+            self._fused[stamp] = pose
+        return self._fusion.cloud()
+
+
+def overlap(points: FloatArray, camera_from_model: FloatArray, others: list[FloatArray], camera: Camera) -> FloatArray:
+    """(V,) share of the (K, 3) points of one view that each of the others sees from the same side and distance."""
+    if not others:
+        return np.zeros(0)
+    poses = np.stack([camera_from_model, *others])
+    inside = np.einsum("vij,kj->vki", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    depth = inside[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = inside[..., 0] / depth * camera.fx + camera.cx
+        v = inside[..., 1] / depth * camera.fy + camera.cy
+    rays = points - -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])[:, None]
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    seen = (depth > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    seen &= np.einsum("vki,ki->vk", rays, rays[0]) > np.cos(SAME_SIDE)
+    seen &= depth < SAME_SCALE * depth[0]
+    return seen[1:].mean(axis=1)
+
+
+def distance(camera_from_world: FloatArray, other_from_world: FloatArray) -> float:
+    """Between the projection centres of two (4, 4) poses."""
+    return float(np.linalg.norm(centre(camera_from_world) - centre(other_from_world)))
+
+
+def centre(camera_from_world: FloatArray) -> FloatArray:
+    """(3,) projection centre of a (4, 4) pose."""
+    return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+
+
+def _decode(image: EncodedImage, width: int) -> tuple[NDArray[np.uint8], Camera]:
+    pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None  # the mapper has read it
+    undistorted = image.camera.undistort_image(pixels.astype(np.uint8, copy=False))
+    return working_image(undistorted, image.camera.pinhole(), width)
+
+
+def _be_nice() -> None:
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # on Linux of this thread and those it starts

@@ -1,0 +1,154 @@
+"""Depth maps of keyframes on the CPU: each keyframe is matched with a few neighbours whose poses are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.config import StereoConfig
+from pipeprog_sfm.dense.patch_refinement import refine
+from pipeprog_sfm.dense.plane_sweep import OVERSAMPLING, sweep
+
+FloatArray = NDArray[np.float64]
+FloatImage = NDArray[np.float32]
+ByteImage = NDArray[np.uint8]
+
+BASELINE_RATIO = (0.08, 0.35)  # of the depth; below, depth is noise; above, the views differ too much to be matched
+BASELINE_RATIO_BEST = 0.2
+VIEW_ANGLE_MAX = np.radians(30.0)  # between optical axes: the images must overlap
+FORWARD_MAX = np.radians(50.0)  # baseline out of the image plane: towards 90 the epipole enters the image
+STRIDE = OVERSAMPLING  # [px] of the working resolution: the sweep's neighbours are at that resolution
+SHADING = 4.0  # [px] of the working resolution
+CORRELATION_MIN = 0.5
+SIGMA_MAX = 0.005
+
+
+@dataclass(frozen=True)
+class StereoImage:
+    """An undistorted keyframe: (H, W, 3) uint8 BGR of a pinhole camera, and its pose in any unit of length."""
+
+    stamp: int
+    image: ByteImage
+    camera: Camera
+    camera_from_world: FloatArray
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth along the optical axis, (h, w) float32 in the unit of the poses, NaN where unknown; (h, w, 3) uint8 BGR."""
+
+    stamp: int
+    depth: FloatImage
+    camera: Camera
+    color: ByteImage
+
+
+def choose_pairs(
+    reference_stamp: int,
+    poses: Mapping[int, FloatArray],
+    median_depth: float,
+    config: StereoConfig,
+) -> list[int]:
+    """Neighbours of a keyframe that are worth matching with it, best first, at most `max_pairs`.
+
+    A neighbour qualifies by its baseline (a share of the median depth), by looking the same way and by standing
+    beside, not in front or behind. Among those, baselines of different direction complement each other: an edge along
+    the one is no match along the other, and what one side occludes the other side sees.
+    """
+    reference = poses[reference_stamp]
+    rotation, centre = reference[:3, :3], _centre(reference)
+    stamps = sorted(stamp for stamp in poses if stamp != reference_stamp)
+    if not stamps:
+        return []
+    stack = np.stack([poses[stamp] for stamp in stamps])
+    centres = -np.einsum("vji,vj->vi", stack[:, :3, :3], stack[:, :3, 3])
+    baselines = (centres - centre) @ rotation.T
+    lengths = np.maximum(np.linalg.norm(baselines, axis=1), 1e-12)
+    ratios = lengths / median_depth
+    view_angles = np.arccos(np.clip(stack[:, 2, :3] @ reference[2, :3], -1.0, 1.0))
+    forward_angles = np.arcsin(np.minimum(1.0, np.abs(baselines[:, 2]) / lengths))
+    fit = (ratios >= BASELINE_RATIO[0]) & (ratios <= BASELINE_RATIO[1])
+    fit &= (view_angles <= VIEW_ANGLE_MAX) & (forward_angles <= FORWARD_MAX)
+    costs = np.abs(np.log(ratios / BASELINE_RATIO_BEST)) + view_angles / VIEW_ANGLE_MAX + forward_angles / FORWARD_MAX
+    candidates = [(stamps[n], float(costs[n]), baselines[n] / lengths[n]) for n in np.flatnonzero(fit)]
+    chosen: list[tuple[int, FloatArray]] = []
+    while candidates and len(chosen) < config.max_pairs:
+        # 1 for a baseline that repeats a chosen one, 0.5 for the opposite one, 0 for one at right angles to all
+        scores = [
+            cost + max((max(float(d @ other), -0.5 * float(d @ other)) for _, other in chosen), default=0.0)
+            for _, cost, d in candidates
+        ]
+        stamp, _, direction = candidates.pop(int(np.argmin(scores)))
+        chosen.append((stamp, direction))
+    return [stamp for stamp, _ in chosen]
+
+
+def depth_map(
+    reference: StereoImage,
+    neighbours: Sequence[StereoImage],
+    depth_range: tuple[float, float],
+    config: StereoConfig,
+) -> DepthMap:
+    """Depth of every STRIDE-th pixel of the reference at working resolution; depth_range = (near, far) of the scene.
+
+    A semi-global sweep over all neighbours at reduced resolution finds the surface, patches at full working resolution
+    then place it to a fraction of a pixel.
+    """
+    near, far = depth_range
+    if not 0.0 < near < far:
+        raise ValueError(f"depth range {near:g} to {far:g} is empty")
+    image, camera = working_image(reference.image, reference.camera, config.width)
+    color = cv2.pyrDown(image)  # its pixel (u, v) is centred at (2 u, 2 v)
+    height, width = color.shape[:2]
+    grid = Camera(width, height, camera.fx / STRIDE, camera.fy / STRIDE, camera.cx / STRIDE, camera.cy / STRIDE)
+    if not neighbours:
+        return DepthMap(reference.stamp, np.full((height, width), np.nan, np.float32), grid, color)
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    others, homographies, epipoles = [], [], []
+    for neighbour in neighbours:
+        other, other_camera = working_image(neighbour.image, neighbour.camera, config.width)
+        others.append(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY).astype(np.float32))
+        other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
+        homographies.append(other_camera.matrix @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
+        epipoles.append(other_camera.matrix @ other_from_reference[:3, 3])
+    homography, epipole = np.stack(homographies), np.stack(epipoles)
+    inverse = sweep(
+        cv2.pyrDown(_without_shading(gray)),
+        np.stack([_low_pass(_without_shading(other)) for other in others]),
+        homography @ np.diag([STRIDE, STRIDE, 1.0]),
+        epipole,
+        (1.0 / far, 1.0 / near),
+    )
+    inverse, correlation, sigma = refine(inverse, gray, np.stack(others), homography, epipole, STRIDE)
+    known = (correlation >= CORRELATION_MIN) & (sigma <= SIGMA_MAX)
+    depth = np.where(known, 1.0 / np.where(known, inverse, 1.0), np.nan).astype(np.float32)
+    return DepthMap(reference.stamp, depth, grid, color)
+
+
+def _without_shading(gray: FloatImage) -> FloatImage:
+    """Only what is finer than SHADING: highlights and shades do not lie on the surface, and move with the camera."""
+    return gray - cv2.GaussianBlur(gray, (0, 0), SHADING)
+
+
+def _low_pass(image: FloatImage) -> FloatImage:
+    """The kernel of cv2.pyrDown, without its decimation."""
+    kernel = np.array([1.0, 4.0, 6.0, 4.0, 1.0], np.float32) / 16.0
+    return cv2.sepFilter2D(image, -1, kernel, kernel)
+
+
+def _centre(camera_from_world: FloatArray) -> FloatArray:
+    return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+
+
+def working_image(image: ByteImage, camera: Camera, width: int) -> tuple[ByteImage, Camera]:
+    """(H, W, 3) image of a pinhole camera, reduced to `width` if it is wider."""
+    factor = width / camera.width
+    if factor >= 1.0:
+        return image, camera
+    camera = camera.scaled(factor)
+    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera

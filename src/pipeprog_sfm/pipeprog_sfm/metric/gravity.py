@@ -1,0 +1,63 @@
+"""The direction up, from an accelerometer beside the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_sfm.metric.map_frame import Vertical
+
+STANDARD = 9.80665  # m/s^2
+DEVIATION = 0.5  # m/s^2: gravity varies by 0.03 over the Earth, cheap accelerometers err by a few tenths
+LEAST_SECONDS = 2.0  # over which a hand's or a robot's own accelerations cancel
+
+
+class GravityError(Exception):
+    """The accelerations tell no vertical; the text says why."""
+
+
+def gravity(
+    stamps: NDArray[np.int64], forces_in_camera: FloatArray, poses: Mapping[int, FloatArray], scale: float
+) -> Vertical:
+    """Up in the model, from the mean of what an accelerometer felt on the way.
+
+    With weights t (T - t) the camera's own accelerations integrate to its places, which the model knows: their mean is
+    12 / T^2 times the middle between first and last place less the mean place (integration by parts, twice).
+
+    Args:
+        stamps: (K,) of the accelerations [ns].
+        forces_in_camera: (K, 3) specific forces along the axes of the camera's optical frame, m/s^2.
+        poses: (4, 4) camera_from_model by stamp, in order of time.
+        scale: metres per model unit.
+
+    Raises:
+        GravityError: too few accelerations, or of a wrong unit.
+    """
+    times = np.array(list(poses), np.int64)
+    seconds = (times - times[0]) * 1e-9
+    inside = (stamps >= times[0]) & (stamps <= times[-1])
+    at, forces = (stamps[inside] - times[0]) * 1e-9, forces_in_camera[inside]
+    whole = float(seconds[-1])
+    if whole < LEAST_SECONDS or len(at) < 10 or np.diff(np.r_[0.0, np.sort(at), whole]).max() > 0.2 * whole:
+        raise GravityError("the accelerations of the IMU do not cover the keyframes: record them all the way")
+    stack = np.stack(list(poses.values()))
+    model_from_camera = Slerp(seconds, Rotation.from_matrix(stack[:, :3, :3].transpose(0, 2, 1)))
+    order = np.argsort(at, kind="stable")
+    at, forces = at[order], model_from_camera(at[order]).apply(forces[order])
+    # Samples may come in bursts: each counts for the time around it.
+    edges = np.r_[0.0, 0.5 * (at[1:] + at[:-1]), whole]
+    weight = at * (whole - at) * np.diff(edges)
+    felt = weight @ forces / weight.sum()
+    centres = -scale * np.einsum("nji,nj->ni", stack[:, :3, :3], stack[:, :3, 3])
+    mean_place = (0.5 * (centres[1:] + centres[:-1]) * np.diff(seconds)[:, None]).sum(0) / whole
+    up = felt - 12.0 / whole**2 * (0.5 * (centres[0] + centres[-1]) - mean_place)
+    size = float(np.linalg.norm(up))
+    if abs(size - STANDARD) > DEVIATION:
+        raise GravityError(
+            f"the IMU feels {size:.2f} m/s^2 on average, not {STANDARD:.2f}: check its unit and its transform"
+        )
+    return Vertical(up / size, "IMU")

@@ -1,0 +1,117 @@
+"""The scale by two cameras on one body: how far apart they are mounted, over how far apart the model has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+
+from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_sfm.config import OdometryConfig
+from pipeprog_sfm.metric.scale import Measurement
+from pipeprog_sfm.metric.transform_tree import NoPathError, TransformTree
+
+LARGEST_SKEW = 1_000_000  # ns between the images of a pair: at a walk the body moves by a millimetre
+LEAST_PAIRS = 3  # from which a spread can be told
+CAUCHY = 2.385  # 95 % efficiency for normal errors (Holland, Welsch 1977)
+MISFIT = 0.3  # median error of a pair over the baseline from which the cameras are not mounted as it is said
+
+
+class RigError(Exception):
+    """Two cameras tell no scale; the text says why."""
+
+
+def rig_measurements(
+    frames: Mapping[int, str], transforms: TransformTree, poses: Mapping[int, FloatArray], config: OdometryConfig
+) -> tuple[list[Measurement], list[str]]:
+    """The scale by each two cameras of one body, and why others tell none.
+
+    Args:
+        frames: optical frame of each image, by stamp [ns].
+        transforms: static ones lead from one camera to the other.
+        poses: (4, 4) camera_from_model by stamp, in order of time.
+        config: how good the mounting is known.
+    """
+    measurements, warnings = [], []
+    for one, other in combinations(sorted(set(frames.values())), 2):
+        try:
+            one_from_other = transforms.static_transform(one, other)
+            measurements.append(_measurement(one, other, one_from_other, frames, poses, config))
+        except (NoPathError, RigError) as error:
+            warnings.append(str(error))
+    return measurements, warnings
+
+
+def _measurement(
+    one: str,
+    other: str,
+    one_from_other: FloatArray,
+    frames: Mapping[int, str],
+    poses: Mapping[int, FloatArray],
+    config: OdometryConfig,
+) -> Measurement:
+    """The robust mean of what each pair of images shows of the baseline, along the baseline.
+
+    The model's baseline projected on the true one errs evenly to both sides; its length would be too long.
+    """
+    names = f"the cameras '{one}' and '{other}'"
+    baseline = one_from_other[:3, 3]
+    length = float(np.linalg.norm(baseline))
+    if MISFIT * length < config.baseline_sigma:
+        raise RigError(f"{names} are as good as in one place, says /tf_static: they tell no scale")
+    pairs = _pairs(one, other, frames, poses)
+    if len(pairs) < LEAST_PAIRS:
+        raise RigError(
+            f"{len(pairs)} images of {names} are of one moment (within {LARGEST_SKEW * 1e-6:g} ms): too few for a scale"
+        )
+    first, second = (np.stack([poses[pair[side]] for pair in pairs]) for side in (0, 1))
+    centres = -np.einsum("nji,nj->ni", second[:, :3, :3], second[:, :3, 3])
+    found = np.einsum("nij,nj->ni", first[:, :3, :3], centres) + first[:, :3, 3]
+    along = found @ baseline / length**2  # model units per metre
+    scale = 1.0 / max(float(np.median(along)), 1e-12)
+    if np.median(np.linalg.norm(scale * found - baseline, axis=1)) > MISFIT * length:
+        raise RigError(f"{names} are not mounted as /tf_static says, or their clocks do not agree")
+    mean = float(np.median(along))
+    for _ in range(20):
+        square = (along - mean) ** 2
+        spread = max(1.4826 * float(np.median(np.sqrt(square))), 1e-9 * mean)
+        weight = 1.0 / (1.0 + square / (CAUCHY * spread) ** 2)
+        weight /= weight.sum()
+        mean = float(weight @ along)
+    sigma = np.hypot(np.sqrt(weight**2 @ (along - mean) ** 2) / mean, config.baseline_sigma / length)
+    return Measurement(
+        "rig", names, -float(np.log(mean)), float(sigma), _gradient(pairs, weight / mean, baseline / length**2, poses)
+    )
+
+
+def _pairs(one: str, other: str, frames: Mapping[int, str], poses: Mapping[int, FloatArray]) -> list[tuple[int, int]]:
+    """Stamps of images of one moment, each used once at most."""
+    first, second = (
+        np.array([stamp for stamp in poses if frames.get(stamp) == name], np.int64) for name in (one, other)
+    )
+    if not len(first) or not len(second):
+        return []
+    gap = np.abs(first[:, None] - second[None])
+    nearest, back = gap.argmin(axis=1), gap.argmin(axis=0)
+    return [
+        (int(first[row]), int(second[column]))
+        for row, column in enumerate(nearest)
+        if back[column] == row and gap[row, column] <= LARGEST_SKEW
+    ]
+
+
+def _gradient(
+    pairs: list[tuple[int, int]], weight: FloatArray, along: FloatArray, poses: Mapping[int, FloatArray]
+) -> FloatArray:
+    """(N, 6) derivatives of the logarithm of the scale by the poses, turned and shifted from the left."""
+    row = {stamp: number for number, stamp in enumerate(poses)}
+    gradient = np.zeros((len(poses), 6))
+    for (first, second), share in zip(pairs, weight, strict=True):
+        a, b = poses[first], poses[second]
+        # Of along . (R_a c_b + t_a) with c_b = -R_b^T t_b.
+        own = b[:3, :3] @ a[:3, :3].T @ along
+        turned = -a[:3, :3] @ b[:3, :3].T @ b[:3, 3]
+        gradient[row[first]] -= share * np.r_[np.cross(turned, along), along]
+        gradient[row[second]] -= share * np.r_[np.cross(b[:3, 3], own), -own]
+    return gradient

@@ -1,0 +1,58 @@
+"""A keyframe as the mapper keeps it: features, calibration, and how much of the image the features cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.sparse.features import Features
+
+FloatArray = NDArray[np.float64]
+
+GRID = (32, 18)
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Features of one image.
+
+    Attributes:
+        stamp: time of the image [ns].
+        features: of the ideal pinhole image.
+        camera: calibration.
+        rays: (N, 2) normalised image coordinates of the features.
+        focal: (2,) focal lengths, px.
+        hull: area of the features' convex hull, px^2.
+        cells: of the grid over the image that hold a feature.
+    """
+
+    stamp: int
+    features: Features
+    camera: Camera
+    rays: FloatArray
+    focal: FloatArray
+    hull: float
+    cells: int
+
+    @staticmethod
+    def of(stamp: int, features: Features, camera: Camera) -> Keyframe:
+        """A keyframe of an image whose features are known."""
+        rays = (features.keypoints - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        hull, cells = hull_area(features.keypoints), grid_cells(features.keypoints, (camera.width, camera.height))
+        return Keyframe(stamp, features, camera, rays, np.array([camera.fx, camera.fy]), hull, cells)
+
+
+def hull_area(pixels: NDArray[np.float32]) -> float:
+    """Area of the convex hull of (N, 2) pixels."""
+    return float(cv2.contourArea(cv2.convexHull(pixels))) if len(pixels) > 2 else 0.0
+
+
+def grid_cells(pixels: NDArray[np.float32], size: tuple[int, int]) -> int:
+    """Cells of a grid over an image of (width, height) that hold one of (N, 2) pixels."""
+    column = (pixels[:, 0] * GRID[0] / size[0]).astype(int)
+    row = (pixels[:, 1] * GRID[1] / size[1]).astype(int)
+    return len(np.unique(row * GRID[0] + column))

@@ -1,0 +1,81 @@
+"""How well each keyframe is tied to the map: Eq. 1 of the paper, told when it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_sfm.sparse.keyframe import Keyframe, grid_cells, hull_area
+from pipeprog_sfm.sparse.sparse_model import SparseModel
+
+IntArray = NDArray[np.int64]
+
+NO_STAMP = -1
+
+
+@dataclass(frozen=True)
+class FrameTie:
+    """Overlap of a keyframe with the map: Eq. 1 of the paper (hull areas) and the share of 32 x 18 cells."""
+
+    stamp: int
+    registered: bool
+    overlap: float
+    cell_overlap: float
+    tie_points: int
+    features: int
+    matches_previous: int
+    matches_next: int
+
+
+class Overlaps:
+    """Remembers of which points of the map each keyframe's overlap was told."""
+
+    def __init__(self) -> None:
+        self._told: dict[int, tuple[int | None, int, int | None]] = {}
+
+    def forget(self, stamp: int) -> None:
+        """A keyframe that comes again is told anew."""
+        self._told.pop(stamp, None)
+
+    def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel) -> list[FrameTie]:
+        """Overlap of the keyframes, by stamp, for which it changed since the last call."""
+        view_of = {stamp: view for view, stamp in enumerate(model.stamps)}
+        stamps = sorted(keyframes)
+        tied = {stamp: model.features(view) for stamp, view in view_of.items()}
+        digests = model.digests().tolist()
+        marks = {stamp: digests[view_of[stamp]] if stamp in view_of else 0 for stamp in stamps}
+        changed = []
+        for before, stamp, after in zip([NO_STAMP, *stamps[:-1]], stamps, [*stamps[1:], NO_STAMP], strict=True):
+            mark = (marks.get(before), marks[stamp], marks.get(after))
+            if self._told.get(stamp) != mark:
+                self._told[stamp] = mark
+                near = (model.point_of[tied[one]] if one in tied else None for one in (before, stamp, after))
+                changed.append(_tie(keyframes[stamp], *near))
+        return changed
+
+
+def _tie(keyframe: Keyframe, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> FrameTie:
+    """Overlap of a keyframe by the points of its features and of its neighbours'; None: not registered."""
+    keypoints = keyframe.features.keypoints
+    inside = keypoints[:0] if own is None else keypoints[own >= 0]
+    size = keyframe.camera.width, keyframe.camera.height
+    return FrameTie(
+        keyframe.stamp,
+        own is not None,
+        hull_area(inside) / max(keyframe.hull, 1e-9),
+        grid_cells(inside, size) / max(keyframe.cells, 1),
+        len(inside),
+        len(keypoints),
+        _common(before, own),
+        _common(own, after),
+    )
+
+
+def _common(points: IntArray | None, others: IntArray | None) -> int:
+    """Points that two views both see."""
+    if points is None or others is None:
+        return 0
+    return len(np.intersect1d(points[points >= 0], others[others >= 0]))

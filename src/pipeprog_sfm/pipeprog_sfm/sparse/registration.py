@@ -1,0 +1,102 @@
+"""An image registered in a model: its pose by the map's points, its tracks, and whether the pose can be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_sfm.sparse.colmap import AbsolutePose, absolute_pose
+from pipeprog_sfm.sparse.guided_matching import link
+from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.sparse.matching import MatchArray
+from pipeprog_sfm.sparse.sparse_model import SparseModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+POSE_ERROR = 4.0  # px, for RANSAC: the map's points move by a pixel or two before they are adjusted
+MIN_INLIERS = 20  # of a pose: far above what chance gives at this error
+RIVAL = 0.5  # of a pose's inliers: as many that agree on another pose make it ambiguous, as repeated texture does
+MIN_SHARE = 0.25  # of the matches with the neighbours that a pose must agree with
+LOCAL_WINDOW = 8  # views that local bundle adjustment moves
+
+
+@dataclass(frozen=True)
+class Location:
+    """A keyframe's pose (4, 4) in a model (None: the reason says why), and its (K, 2) feature and point pairs."""
+
+    camera_from_model: FloatArray | None
+    pairs: IntArray
+    reason: str
+
+
+def locate(model: SparseModel, keyframe: Keyframe, matches: Mapping[int, MatchArray], seed: int) -> Location:
+    """Pose by the map points that other views see; matches: of the keyframe with each of these, by stamp."""
+    pairs = []
+    for stamp, found in matches.items():
+        offset = model.offsets[model.stamps.index(stamp)]
+        pairs.append(np.stack([found[:, 0], model.point_of[offset + found[:, 1]]], axis=1))
+    known = np.concatenate(pairs)
+    known = np.unique(known[known[:, 1] >= 0], axis=0)
+    pose = _absolute_pose(model, keyframe, known, seed)
+    if pose is None or pose.inliers.sum() < MIN_INLIERS:
+        agreeing = 0 if pose is None else int(pose.inliers.sum())
+        return Location(None, known[:0], f"only {agreeing} of {len(known)} matches agree on a pose")
+    rest = known[~pose.inliers]
+    if len(rest) >= RIVAL * pose.inliers.sum():
+        rival = _absolute_pose(model, keyframe, rest, seed)
+        if rival is not None and rival.inliers.sum() >= RIVAL * pose.inliers.sum():
+            reason = f"{pose.inliers.sum()} matches agree on a pose and {rival.inliers.sum()} on another one"
+            return Location(None, known[:0], reason)
+    return Location(pose.camera_from_model, known[pose.inliers], "")
+
+
+def enter(model: SparseModel, keyframe: Keyframe, location: Location, keyframes: Mapping[int, Keyframe]) -> int:
+    """Adds a located keyframe: its pose, then tracks and local adjustment; returns its view.
+
+    keyframes: at least those of the model's views and this one, by stamp.
+    """
+    assert location.camera_from_model is not None
+    used = location.pairs
+    view = model.add_view(keyframe.stamp, keyframe.rays, keyframe.focal, location.camera_from_model)
+    first = np.unique(used[:, 0], return_index=True)[1]
+    model.point_of[model.offsets[view] + used[first, 0]] = used[first, 1]
+    link(model, view, keyframes)
+    _adjust_around(model, view)
+    return view
+
+
+def objection(model: SparseModel, view: int, matches: Mapping[int, MatchArray]) -> str:
+    """Why a pose cannot be believed: too few points, or matches with its neighbours, by stamp, that contradict it."""
+    tied = len(model.seen(view))
+    if tied < MIN_INLIERS:
+        return f"only {tied} points hold its pose"
+    errors = [
+        model.epipolar_errors(view, model.stamps.index(other), found)
+        for other, found in matches.items()
+        if other in model.stamps
+    ]
+    error = np.concatenate(errors) if errors else np.empty(0)
+    share = float((error < POSE_ERROR).mean()) if len(error) else 1.0
+    if share < MIN_SHARE:
+        return f"only {share:.0%} of the matches with its neighbours agree with its pose"
+    return ""
+
+
+def _absolute_pose(model: SparseModel, keyframe: Keyframe, pairs: IntArray, seed: int) -> AbsolutePose | None:
+    pixels, points = keyframe.features.keypoints[pairs[:, 0]], model.points[pairs[:, 1]]
+    return absolute_pose(pixels, points, keyframe.camera, POSE_ERROR, seed)
+
+
+def _adjust_around(model: SparseModel, view: int) -> None:
+    """Adjusts a view with those that share most points with it."""
+    shared = model.covisible(view)
+    window = np.argsort(-shared, kind="stable")[: LOCAL_WINDOW - 1]
+    window = np.append(window[shared[window] > 0], view)
+    if len(model) <= LOCAL_WINDOW:
+        model.adjust(None, 10, 1e-3)
+    else:
+        model.adjust(window, 10, 1e-3)

@@ -1,0 +1,44 @@
+"""A new model, started from two keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeprog_sfm.sparse.colmap import relative_pose
+from pipeprog_sfm.sparse.guided_matching import link
+from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.sparse.matching import MatchArray
+from pipeprog_sfm.sparse.registration import POSE_ERROR
+from pipeprog_sfm.sparse.sparse_model import SparseModel
+
+START_POINTS = 40  # of a new model
+START_ANGLE = np.radians(3.0)  # median between the rays of its points
+
+
+def model_of_pair(first: Keyframe, second: Keyframe, matches: MatchArray, seed: int) -> SparseModel | None:
+    """The model that two keyframes with (M, 2) matches give; None: too few points, or depths too uncertain.
+
+    The first one is its origin, and the distance between the two its unit.
+    """
+    if len(matches) < START_POINTS:
+        return None
+    pixels, other_pixels = first.features.keypoints[matches[:, 0]], second.features.keypoints[matches[:, 1]]
+    pose = relative_pose(pixels, other_pixels, first.camera, second.camera, 0.5 * POSE_ERROR, seed)
+    if pose is None or pose.inliers.sum() < START_POINTS:
+        return None
+    model = SparseModel()
+    model.add_view(first.stamp, first.rays, first.focal, np.eye(4))
+    view = model.add_view(second.stamp, second.rays, second.focal, pose.b_from_a)
+    pairs = matches[pose.inliers].astype(np.int64)
+    pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+    model.link(pairs[:, 1] + model.offsets[view], pairs[:, 0])
+    model.adjust(None, 20, 1e-4)
+    link(model, view, {first.stamp: first, second.stamp: second})
+    model.adjust(None, 20, 1e-4)
+    ids, _, _ = model.observations(np.ones(len(model.points), bool))
+    if len(ids) < START_POINTS:
+        return None
+    rays = model.points[ids, None] - model.centres()[None]
+    cosine = (rays[:, 0] * rays[:, 1]).sum(axis=1) / np.linalg.norm(rays, axis=2).prod(axis=1)
+    angle = np.median(np.arccos(np.clip(cosine, -1, 1)))
+    return model if angle > START_ANGLE else None

@@ -1,0 +1,111 @@
+"""The dense mapper on a walk along a textured wall, in exact views."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.config import FusionConfig, StereoConfig
+from pipeprog_sfm.dense.dense_mapper import DenseMapper, EncodedImage, overlap
+
+WIDTH, HEIGHT = 240, 160
+CAMERA = Camera(WIDTH, HEIGHT, 220.0, 220.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+STEP = 16  # px between two views of the wall at a distance of 1 m
+TEXTURE = cv2.resize(
+    np.random.default_rng(0).integers(0, 256, (HEIGHT // 4, WIDTH), np.uint8),
+    (4 * WIDTH, HEIGHT),
+    interpolation=cv2.INTER_CUBIC,
+)
+X = np.random.default_rng(1).uniform([-0.5, -0.35], [3.5, 0.35], (4000, 2))
+POINTS = np.c_[X, np.ones(len(X))]  # of the wall, in metres
+
+
+def pose(place: int) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[0, 3] = -place * STEP / CAMERA.fx
+    return matrix
+
+
+def image(place: int) -> EncodedImage:
+    view = np.ascontiguousarray(TEXTURE[:, place * STEP :][:, :WIDTH])
+    return EncodedImage(cv2.imencode(".png", view)[1].tobytes(), CAMERA)
+
+
+def seen(camera_from_world: np.ndarray) -> np.ndarray:
+    inside = POINTS + camera_from_world[:3, 3]
+    pixels = inside[:, :2] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
+    return POINTS[(pixels > 0).all(axis=1) & (pixels < [WIDTH, HEIGHT]).all(axis=1)]
+
+
+def walk(places: list[int]) -> tuple[DenseMapper, dict[int, np.ndarray], list[int]]:
+    """The mapper after keyframes at these places, their poses, and the number of depth maps after each."""
+    dense = DenseMapper(StereoConfig(), FusionConfig())
+    poses: dict[int, np.ndarray] = {}
+    images = {}
+    counts = []
+    for stamp, place in enumerate(places):
+        poses[stamp], images[stamp] = pose(place), image(place)
+        dense.update(poses, images, lambda other: seen(poses[other]), complete=False)
+        counts.append(len(dense))
+    dense.update(poses, images, lambda other: seen(poses[other]), complete=True)
+    return dense, poses, [*counts, len(dense)]
+
+
+@pytest.fixture(scope="module")
+def there() -> tuple[DenseMapper, dict[int, np.ndarray], list[int]]:
+    return walk(list(range(12)))
+
+
+def test_the_cloud_is_the_wall(there: tuple[DenseMapper, dict[int, np.ndarray], list[int]]) -> None:
+    dense, poses, _ = there
+    cloud = dense.fuse(poses, poses, 1.0, complete=True).result()
+    assert len(cloud.points) > 5000  # 1.1 m x 0.7 m are seen thrice, a pixel of the depth maps is 9 mm
+    # 0.1 px of disparity at the baseline of two steps: 0.1 / 32 of the distance
+    assert np.median(np.abs(cloud.points[:, 2] - 1.0)) < 0.003
+    assert np.quantile(np.abs(cloud.points[:, 2] - 1.0), 0.95) < 0.01
+
+
+def test_lengths_follow_the_scale_and_the_drift_of_the_unit(
+    there: tuple[DenseMapper, dict[int, np.ndarray], list[int]],
+) -> None:
+    dense, poses, _ = there
+    halved = {stamp: matrix.copy() for stamp, matrix in poses.items()}
+    for matrix in halved.values():
+        matrix[:3, 3] /= 2.0  # the model has shrunk since the depth maps were made
+    cloud = dense.fuse(poses, halved, 2.0, complete=True).result()
+    assert np.median(np.abs(cloud.points[:, 2] - 1.0)) < 0.003
+
+
+def test_what_is_seen_again_makes_no_more_depth_maps() -> None:
+    _, _, counts = walk([*range(8), *range(7, -1, -1), *range(8)])
+    assert 3 <= counts[9] <= 8
+    assert counts[-1] <= counts[9] + 1
+
+
+def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
+    places = [place for place in range(8) for _ in range(2)]
+    dense, poses, counts = walk(places)
+    images = {stamp: image(place) for stamp, place in enumerate(places)}
+    dense.retire([stamp for stamp in poses if stamp % 2 == 0])
+    assert len(dense) < counts[-1]
+    left = {stamp: matrix for stamp, matrix in poses.items() if stamp % 2 == 1}
+    dense.update(left, images, lambda other: seen(left[other]), complete=True)
+    assert len(dense) >= counts[-1] - 1
+    assert len(dense.fuse(left, left, 1.0, complete=True).result().points) > 1000
+
+
+def test_overlap_is_the_share_seen_from_the_same_side() -> None:
+    points = seen(pose(4))
+    turned = pose(4)
+    turned[:3, :3] = cv2.Rodrigues(np.array([0.0, np.pi, 0.0]))[0]
+    nearer = pose(4)
+    nearer[2, 3] = 0.5  # farther away: all of it, but smaller
+    share = overlap(points, pose(4), [pose(4), pose(5), pose(12), turned, nearer], CAMERA)
+    assert share[0] == 1.0
+    assert share[1] == pytest.approx(1 - STEP / WIDTH, abs=0.03)
+    assert share[2] == 0.0  # 31 degrees round
+    assert share[3] == 0.0
+    assert share[4] < 1.0
+    assert len(overlap(points, pose(4), [], CAMERA)) == 0

@@ -1,0 +1,166 @@
+"""Depth maps against a ray-cast wall with a pipe in front of it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.config import StereoConfig
+from pipeprog_sfm.dense.stereo import StereoImage, choose_pairs, depth_map
+
+CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
+WALL, AXIS, RADIUS = 2.0, 1.75, 0.15  # metres in front of the middle of the row; the pipe stands upright
+RANGE = (1.2, 3.0)
+CONFIG = StereoConfig()
+
+
+def texture(points):
+    """Grey of surface points: a fixed sum of waves of 3 to 12 cm, about 4 to 16 pixels."""
+    rng = np.random.default_rng(3)
+    waves = rng.normal(size=(40, 3))
+    waves *= (2 * np.pi / rng.uniform(0.03, 0.12, 40) / np.linalg.norm(waves, axis=1))[:, None]
+    return 128.0 + 14.0 * np.sin(points @ waves.T + rng.uniform(0, 2 * np.pi, 40)).sum(axis=-1)
+
+
+def pose(centre, rotation=(0.0, 0.0, 0.0)):
+    """camera_from_world of a camera at `centre`, turned by a rotation vector; unturned it looks along +z."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
+    matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(centre, float)
+    return matrix
+
+
+def cast(camera_from_world, camera=CAMERA):
+    """Depth along the optical axis and surface points (h, w, 3) of the wall and the pipe."""
+    rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], -1)
+    rays = rays @ camera_from_world[:3, :3]
+    centre = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+    depth = (WALL - centre[2]) / rays[..., 2]
+    a = rays[..., 0] ** 2 + rays[..., 2] ** 2
+    b = rays[..., 0] * centre[0] + rays[..., 2] * (centre[2] - AXIS)
+    c = centre[0] ** 2 + (centre[2] - AXIS) ** 2 - RADIUS**2
+    hit = b * b - a * c > 0
+    depth[hit] = ((-b - np.sqrt(np.where(hit, b * b - a * c, 0.0))) / a)[hit]
+    return depth, centre + depth[..., None] * rays, hit
+
+
+def view(stamp, camera_from_world):
+    gray = np.clip(texture(cast(camera_from_world)[1]), 0, 255).astype(np.uint8)
+    return StereoImage(stamp, np.repeat(gray[..., None], 3, axis=2), CAMERA, camera_from_world)
+
+
+LAYOUTS = {
+    "along the row": ([0, 0, 0], [[-0.35, 0, 0], [-0.2, 0.02, 0], [0.2, 0, 0.02], [0.35, 0, 0]], 0.0),
+    "up and down": ([0, 0, 0], [[0, -0.35, 0], [0.02, -0.2, 0], [0, 0.2, 0], [0, 0.35, 0.03]], 0.0),
+    "camera on its side": ([0, 0, 0], [[-0.35, 0, 0], [-0.2, 0, 0], [0.2, 0, 0.02], [0.35, 0, 0]], np.pi / 2),
+}
+
+
+@pytest.fixture(scope="module", params=LAYOUTS, ids=list(LAYOUTS))
+def scene(request):
+    centre, others, roll = LAYOUTS[request.param]
+    reference = view(0, pose(centre, [0, 0, roll]))
+    neighbours = [view(i + 1, pose(c, [0.02 * i, -0.1 * c[0], roll])) for i, c in enumerate(others)]
+    return reference, neighbours, depth_map(reference, neighbours, RANGE, CONFIG)
+
+
+def test_depth_lies_on_the_true_surfaces(scene):
+    reference, _, found = scene
+    depth, _, on_pipe = cast(reference.camera_from_world, found.camera)
+    error = found.depth - depth
+    interior = np.zeros(depth.shape, bool)
+    interior[6:-6, 6:-6] = True
+    wall, pipe = interior & ~on_pipe, interior & on_pipe
+    # 0.1 px of disparity at a baseline of 0.35 m: 2^2 * 0.1 / (260 * 0.35) = 4 mm
+    assert np.isfinite(error[wall]).mean() > 0.85
+    assert np.nanmedian(np.abs(error[wall])) < 0.004
+    assert np.isfinite(error[pipe]).mean() > 0.85
+    assert np.nanmedian(np.abs(error[pipe])) < 0.006
+    assert (np.abs(error[interior & np.isfinite(error)]) > 0.05).mean() < 0.05  # outliers, fattened edges
+
+
+def test_same_input_gives_the_same_bytes(scene):
+    reference, neighbours, found = scene
+    assert depth_map(reference, neighbours, RANGE, CONFIG).depth.tobytes() == found.depth.tobytes()
+
+
+def test_unit_of_length_does_not_matter(scene):
+    reference, neighbours, found = scene
+
+    def scaled(image):
+        matrix = image.camera_from_world.copy()
+        matrix[:3, 3] *= 8.0  # a power of two: exact
+        return StereoImage(image.stamp, image.image, image.camera, matrix)
+
+    far = depth_map(scaled(reference), [scaled(n) for n in neighbours], (8 * RANGE[0], 8 * RANGE[1]), CONFIG)
+    both = np.isfinite(far.depth) & np.isfinite(found.depth)
+    assert both.mean() > 0.99 * np.isfinite(found.depth).mean()
+    np.testing.assert_allclose(far.depth[both], 8 * found.depth[both], rtol=2e-3)
+
+
+def test_wrong_depth_range_is_refused(scene):
+    reference, neighbours, _ = scene
+    with pytest.raises(ValueError, match="depth range"):
+        depth_map(reference, neighbours, (2.0, 1.0), CONFIG)
+
+
+def test_one_neighbour_is_enough_and_none_gives_nothing(scene):
+    reference, neighbours, _ = scene
+    single = depth_map(reference, neighbours[:1], RANGE, CONFIG)
+    error = single.depth - cast(reference.camera_from_world, single.camera)[0]
+    assert np.isfinite(error).mean() > 0.5
+    assert np.nanmedian(np.abs(error)) < 0.006
+    assert not np.isfinite(depth_map(reference, [], RANGE, CONFIG).depth).any()
+
+
+def test_bare_surface_has_no_depth():
+    noise = np.random.default_rng(0)
+    images = [
+        StereoImage(i, noise.integers(126, 130, (240, 320, 3)).astype(np.uint8), CAMERA, pose([0.15 * i, 0, 0]))
+        for i in range(3)
+    ]
+    assert np.isfinite(depth_map(images[0], images[1:], RANGE, CONFIG).depth).mean() < 0.1  # matches by chance
+
+
+def test_working_width_bounds_the_map():
+    reference, other = view(0, pose([0, 0, 0])), view(1, pose([0.3, 0, 0]))
+    found = depth_map(reference, [other], RANGE, StereoConfig(width=160))
+    assert found.depth.shape == found.color.shape[:2] == (60, 80) == (found.camera.height, found.camera.width)
+    # halved with aligned pixel areas (2 u + 0.5), then every second centre (2 u)
+    np.testing.assert_allclose([2 * 2 * found.camera.cx + 0.5, 4 * found.camera.fx], [CAMERA.cx, CAMERA.fx])
+
+
+def test_pairs_stand_beside_not_in_front_and_look_the_same_way():
+    poses = {
+        0: pose([0, 0, 0]),
+        1: pose([0.4, 0, 0]),
+        2: pose([-0.4, 0, 0]),
+        3: pose([0, 0, 0.4]),  # in front: the epipole lies in the image
+        4: pose([0.05, 0, 0]),  # too near
+        5: pose([1.5, 0, 0]),  # too far
+        6: pose([0.4, 0.02, 0], [0, 1.2, 0]),  # looks elsewhere
+    }
+    chosen = choose_pairs(0, poses, 2.0, StereoConfig(max_pairs=8))
+    assert sorted(chosen) == [1, 2]
+
+
+def test_pairs_of_different_direction_come_first():
+    centres = [[0, 0, 0], [0.4, 0, 0], [0.42, 0, 0], [0.38, 0, 0], [-0.4, 0, 0], [0, 0.45, 0]]
+    poses = {stamp: pose(centre) for stamp, centre in enumerate(centres)}
+    assert sorted(choose_pairs(0, poses, 2.0, StereoConfig(max_pairs=3))) == [1, 4, 5]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.floats(0.01, 100.0))
+def test_pairs_do_not_depend_on_the_frame_or_unit_of_the_world(seed, scale):
+    rng = np.random.default_rng(seed)
+    poses = {i: pose(rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.3, 0.3, 3)) for i in range(8)}
+    moved = pose(rng.uniform(-5, 5, 3), rng.uniform(-2, 2, 3))
+    others = {}
+    for stamp, matrix in poses.items():
+        others[stamp] = matrix @ moved
+        others[stamp][:3, 3] *= scale
+    assert choose_pairs(0, poses, 2.0, CONFIG) == choose_pairs(0, others, 2.0 * scale, CONFIG)

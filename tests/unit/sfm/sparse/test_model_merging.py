@@ -1,0 +1,38 @@
+"""Models made one that share a keyframe."""
+
+from __future__ import annotations
+
+import pytest
+from scenes import STEP, in_model, keyframe, matched, started
+
+from pipeprog_sfm.sparse.model_merging import merge, relation
+from pipeprog_sfm.sparse.registration import enter, locate
+
+TOLERANCE = 0.02  # of the base: 0.3 px of 300 points at 2 m are some 3 mm of a view's place
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_models_that_share_a_view_are_made_one(swapped: bool) -> None:
+    """The view is in one of them and located in the other; it does not matter which of them is larger."""
+    model, other = started(0, 1), started(2, 3)
+    if swapped:
+        fourth = keyframe(4)
+        location = locate(other, fourth, {3 * STEP: matched(fourth, keyframe(3))}, seed=0)
+        enter(other, fourth, location, {n * STEP: keyframe(n) for n in (2, 3, 4)})
+    location = locate(model, keyframe(2), {STEP: matched(keyframe(2), keyframe(1))}, seed=0)
+    found = relation(other, 0, model, location)
+    assert found is not None
+    assert found[0] == pytest.approx(1.0, abs=2 * TOLERANCE), "both have the same unit"
+    smaller, larger = merge(other, model, *found)
+    assert (smaller is model) == swapped
+    assert sorted(larger.stamps) == [n * STEP for n in range(5 if swapped else 4)]
+    centres = {stamp: larger.centre(view) for view, stamp in enumerate(larger.stamps)}
+    first, second = (2, 3) if swapped else (0, 1)
+    for stamp, place in centres.items():
+        assert place == pytest.approx(in_model(first, second, stamp // STEP), abs=5 * TOLERANCE)
+
+
+def test_a_view_without_a_place_relates_nothing() -> None:
+    model, other = started(0, 1), started(16, 17)
+    location = locate(model, keyframe(16), {STEP: matched(keyframe(16), keyframe(1))}, seed=0)
+    assert relation(other, 0, model, location) is None

@@ -1,0 +1,47 @@
+"""Eq. 1 of the paper on a map that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import CAMERA, STEP
+
+from pipeprog_sfm.sparse.features import Features
+from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.sparse.overlap import Overlaps
+from pipeprog_sfm.sparse.sparse_model import SparseModel
+
+
+def keyframe(stamp: int, corners: list[tuple[float, float]]) -> Keyframe:
+    return Keyframe.of(stamp, Features(np.array(corners, np.float32), np.zeros((len(corners), 128), np.uint8)), CAMERA)
+
+
+SQUARE = [(100.0, 100.0), (500.0, 100.0), (500.0, 500.0), (100.0, 500.0)]
+
+
+def test_overlap_is_the_share_of_the_hull_and_of_the_cells_that_tie_points_span() -> None:
+    first, second = keyframe(0, SQUARE), keyframe(STEP, SQUARE)
+    model = SparseModel()
+    for one in (first, second):
+        model.add_view(one.stamp, one.rays, one.focal, np.eye(4))
+    model.points = np.zeros((4, 3))
+    model.point_of[:] = [0, 1, 2, 3, 0, 1, 2, -1]
+    keyframes = {0: first, STEP: second, 2 * STEP: keyframe(2 * STEP, SQUARE)}
+    told = {tie.stamp: tie for tie in Overlaps().changed(keyframes, model)}
+    assert (told[0].overlap, told[0].cell_overlap, told[0].tie_points) == (1.0, 1.0, 4)
+    # Three corners span half of the square, in three of four cells.
+    assert (told[STEP].overlap, told[STEP].cell_overlap) == (pytest.approx(0.5), 0.75)
+    assert (told[STEP].tie_points, told[STEP].features) == (3, 4)
+    assert told[0].matches_next == told[STEP].matches_previous == 3
+    assert not told[2 * STEP].registered
+    assert (told[2 * STEP].overlap, told[STEP].matches_next) == (0.0, 0)
+
+
+def test_it_is_told_again_when_it_changes_and_when_it_was_forgotten() -> None:
+    one, overlaps, model = keyframe(0, SQUARE), Overlaps(), SparseModel()
+    assert len(overlaps.changed({0: one}, model)) == 1
+    assert overlaps.changed({0: one}, model) == []
+    overlaps.forget(0)
+    assert len(overlaps.changed({0: one}, model)) == 1
+    model.add_view(0, one.rays, one.focal, np.eye(4))
+    assert [tie.registered for tie in overlaps.changed({0: one}, model)] == [True]

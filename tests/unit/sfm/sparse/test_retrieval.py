@@ -1,0 +1,48 @@
+"""Keyframes that show the same, among others that do not."""
+
+from __future__ import annotations
+
+import pytest
+from scenes import CAMERA, STEP, pose, view
+
+import pipeprog_sfm.sparse.retrieval as retrieval_module
+from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.sparse.retrieval import RETRIEVED, Retrieval
+
+
+def keyframe(n: int, x: float) -> Keyframe:
+    return Keyframe.of(n * STEP, view(pose(x), n), CAMERA)
+
+
+def test_the_views_that_look_alike_come_first() -> None:
+    others = [keyframe(n, x) for n, x in enumerate([4.0, 0.3, 3.0, 0.1, 5.0])]
+    assert Retrieval().resembling(keyframe(9, 0.0), others, 20).tolist() == [3, 1]
+    assert not len(Retrieval().resembling(keyframe(9, 0.0), [others[0], others[4]], 20))
+
+
+@pytest.mark.parametrize("count", [1, RETRIEVED, 23])
+def test_every_view_has_its_turn(count: int) -> None:
+    retrieval = Retrieval()
+    turns = [retrieval.turn(count).tolist() for _ in range(count)]
+    assert {len(set(turn)) for turn in turns} == {min(count, RETRIEVED)}
+    assert set().union(*turns) == set(range(count))
+
+
+def test_matches_are_found_once_and_anew_after_other_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second, retrieval = keyframe(0, 0.0), keyframe(1, 0.1), Retrieval()
+    found = retrieval.matches(first, second, 400)
+    assert len(found) > 50
+    with monkeypatch.context() as patched:
+        patched.setattr(retrieval_module, "match", lambda *descriptors: pytest.fail("matched again"))
+        assert retrieval.matches(first, second, 400) is found
+    retrieval.forget(second.stamp)
+    assert retrieval.matches(first, second, 400) is not found
+
+
+def test_what_is_remembered_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retrieval_module, "PAIRS_REMEMBERED", 2)
+    keyframes, retrieval = [keyframe(n, 0.1 * n) for n in range(4)], Retrieval()
+    first = retrieval.matches(keyframes[0], keyframes[1], 50)
+    for other in keyframes[2:]:
+        retrieval.matches(keyframes[0], other, 50)
+    assert retrieval.matches(keyframes[0], keyframes[1], 50) is not first
