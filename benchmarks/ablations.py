@@ -35,11 +35,11 @@ from pipeprog_bringup.cloud_io import read_cloud
 from pipeprog_bringup.results import read_trajectory
 from pipeprog_bringup.score import Result, Segment, align, read_truth, score
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.bill import load_bill
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.keyframes import Keyframes
-from pipeprog_detect.pipe import Cloud, Pipe
+from pipeprog_detect.keyframe_cache import Keyframes
+from pipeprog_detect.product.boq import load_bill
+from pipeprog_detect.types import Cloud, Pipe
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.selector import FrameSelector
@@ -71,14 +71,14 @@ def _no_end(*_: Any, **__: Any) -> None:
 
 
 # What the normals let through: the sector of the circumference whose normals voted for the pipe.
-NO_GATE = (("pipeprog_detect.verify._facing", _all_points),)
+NO_GATE = (("pipeprog_detect.cloud.candidate._facing", _all_points),)
 CLOUD_ALONE = replace(DetectConfig(), contour=replace(DetectConfig().contour, enabled=False))
 STAGES = {
     "all stages": Stage(),
     "without the normal gate": Stage(patches=NO_GATE),
     "without contours (cloud alone)": Stage(CLOUD_ALONE),
     "without contours and the normal gate": Stage(CLOUD_ALONE, NO_GATE),
-    "without rims": Stage(patches=(("pipeprog_detect.contour.find_end", _no_end),)),
+    "without rims": Stage(patches=(("pipeprog_detect.silhouette.contour_refinement.find_end", _no_end),)),
     "without the posterior (k-means)": Stage(replace(DetectConfig(), classifier="kmeans")),
 }
 ECCENTRICITY, FEEDBACK = "without the correction for eccentricity", "without feedback"

@@ -28,13 +28,13 @@ from sensor_msgs.msg import CompressedImage
 from benchmarks.recordings import ROOT, Recording, made, named
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.bag import Bag
-from pipeprog_detect import background, normals, octree
+from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
+from pipeprog_detect.cloud.axis_voting import Hypothesis
+from pipeprog_detect.cloud.candidate import Candidate, measure
+from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.contour import Start, refine
-from pipeprog_detect.fit import basis
-from pipeprog_detect.hypotheses import Hypothesis
-from pipeprog_detect.pipe import Cylinder, FloatArray, View
-from pipeprog_detect.verify import Candidate, measure
+from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.types import Cylinder, FloatArray, View
 
 sys.path.insert(0, str(ROOT / "bags"))
 from sitegen.primitives import cylinder, rectangle
@@ -58,9 +58,9 @@ def cloud(trials: int) -> None:
         rng = np.random.default_rng([round(1e4 * radius), arc, round(noise)])
         points, truth = scanned(radius, np.radians(arc), 1e-3 * noise, rng)
         tree = octree.build(points)
-        sigma = normals.estimate_noise(tree)
+        sigma = local_shape.estimate_noise(tree)
         # As in the detector, which fits what is left beside large planes.
-        tree = tree.subset(~background.find_planes(tree, sigma, 1.5 * max(RADII))[1])
+        tree = tree.subset(~plane_segmentation.find_planes(tree, sigma, 1.5 * max(RADII))[1])
         free = np.ones(len(tree.points), bool)
         middle = 0.5 * (truth.start + truth.end)
         half = max(2.0 * radius, 0.05)

@@ -23,9 +23,9 @@ import numpy as np
 from benchmarks.front_ends import LAYOUTS, STATIONS, taken
 from benchmarks.recordings import ROOT
 from benchmarks.survey import RESULTS, commit
-from pipeprog_detect.bill import Bill, PipeClass
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
+from pipeprog_detect.product.boq import Bill, PipeClass
 
 KEPT = ROOT / "out" / "cost"
 SEED = 21

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 
 from pipeprog_bringup.score import Segment, match, relation
-from pipeprog_detect.bill import Bill, PipeClass
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.pipe import Cloud, Cylinder
+from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.types import Cloud, Cylinder
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bags"))
 from sitegen.field import build_field

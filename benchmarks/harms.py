@@ -59,14 +59,14 @@ HARMS = {
     "half a pixel between COLMAP and ROS": Harm(
         "pipeprog_sfm.sparse.colmap._pixels", lambda _: lambda pixels: pixels.astype(float), "sfm"
     ),
-    "half a pixel in the projection of rims": Harm("pipeprog_detect.rim.project", _shifted, "detect"),
+    "half a pixel in the projection of rims": Harm("pipeprog_detect.silhouette.pipe_ends.project", _shifted, "detect"),
     "no sector of the normals in the detector": Harm(
-        "pipeprog_detect.verify._facing", lambda _: lambda points, *_: points, "detect"
+        "pipeprog_detect.cloud.candidate._facing", lambda _: lambda points, *_: points, "detect"
     ),
     "the mean of the errors for their root mean square": Harm(
         "pipeprog_bringup.score._rms", lambda _: lambda values: float(np.mean(np.abs(values))), "bringup/test_score.py"
     ),
-    "no end from rims": Harm("pipeprog_detect.contour.find_end", lambda _: lambda *_, **__: None, "detect"),
+    "no end from rims": Harm("pipeprog_detect.silhouette.contour_refinement.find_end", lambda _: lambda *_, **__: None, "detect"),
 }
 
 

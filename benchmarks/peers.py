@@ -25,7 +25,7 @@ from benchmarks.recordings import ROOT
 from benchmarks.survey import RESULTS, commit
 from pipeprog_bringup.score import Segment
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.pipe import Cylinder
+from pipeprog_detect.types import Cylinder
 
 ENVIRONMENT = ROOT / "out" / "peers-venv"
 PACKAGES = (

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_bringup.cloud_io import read_cloud
-from pipeprog_detect.bill import Bill, PipeClass
+from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.fit import basis
-from pipeprog_detect.pipe import Cylinder
+from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.types import Cylinder
 
 SIZES_MM = (180, 195, 200, 340, 400)
 RESULTS = Path(__file__).parent / "results" / "sewer.json"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.pipe import Cloud
+from pipeprog_detect.types import Cloud
 
 FloatArray = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from pipeprog_bringup.passage import State
-    from pipeprog_detect.classify import ClassProgress
-    from pipeprog_detect.pipe import Pipe
+    from pipeprog_detect.product.classification import ClassProgress
+    from pipeprog_detect.types import Pipe
 
 
 def output_console() -> Console:

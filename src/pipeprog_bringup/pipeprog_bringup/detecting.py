@@ -11,11 +11,11 @@ from pipeprog_bringup import results
 from pipeprog_bringup.cloud_io import read_cloud
 from pipeprog_bringup.output import OutputFolder
 from pipeprog_bringup.overrides import effective
-from pipeprog_detect.bill import Bill, load_bill
-from pipeprog_detect.classify import ClassProgress, progress
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.pipe import Pipe
+from pipeprog_detect.product.boq import Bill, load_bill
+from pipeprog_detect.product.classification import ClassProgress, progress
+from pipeprog_detect.types import Pipe
 
 # The file's own metres are the scale: none was measured, so nothing is added to the pipes' sigmas.
 SCALE = results.Scale("cloud", 0.0)

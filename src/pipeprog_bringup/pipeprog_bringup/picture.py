@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipeprog_detect.pipe import Cylinder
+from pipeprog_detect.types import Cylinder
 
 FloatArray = NDArray[np.float64]
 Color = tuple[float, float, float]

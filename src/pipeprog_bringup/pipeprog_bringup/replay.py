@@ -22,9 +22,9 @@ from pipeprog_bringup.overrides import as_parameters, effective
 from pipeprog_bringup.passage import Passage, State
 from pipeprog_bringup.survey_files import record_keyframes, record_survey, write_survey
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.bill import load_bill
-from pipeprog_detect.classify import ClassProgress
-from pipeprog_detect.pipe import Pipe
+from pipeprog_detect.product.boq import load_bill
+from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.types import Pipe
 from pipeprog_sfm.boards.board_file import Targets, load_targets
 
 

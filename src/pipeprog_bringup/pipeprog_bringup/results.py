@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from pipeprog_bringup.output import OutputFolder
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.bill import Bill
-from pipeprog_detect.classify import ClassProgress, by_kmeans
-from pipeprog_detect.network import PipeRun, pipe_runs
-from pipeprog_detect.pipe import Pipe
+from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.classification import ClassProgress, by_kmeans
+from pipeprog_detect.product.pipe_runs import PipeRun, pipe_runs
+from pipeprog_detect.types import Pipe
 
 FloatArray = NDArray[np.float64]
 

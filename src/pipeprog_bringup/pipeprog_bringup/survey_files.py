@@ -13,8 +13,8 @@ from pipeprog_bringup.cloud_io import write_las, write_ply
 from pipeprog_bringup.frame_log import FrameLog
 from pipeprog_bringup.output import OutputFolder
 from pipeprog_bringup.passage import LastMessages, calibration
-from pipeprog_detect.classify import ClassProgress
-from pipeprog_detect.pipe import Cylinder, Pipe
+from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.types import Cylinder, Pipe
 from pipeprog_msgs import msg
 from pipeprog_node import messages
 

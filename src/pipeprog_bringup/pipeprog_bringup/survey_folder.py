@@ -18,7 +18,7 @@ from pipeprog_bringup import picture
 from pipeprog_bringup.results import read_trajectory
 from pipeprog_bringup.score import read_json
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.pipe import Cylinder
+from pipeprog_detect.types import Cylinder
 
 FloatArray = NDArray[np.float64]
 

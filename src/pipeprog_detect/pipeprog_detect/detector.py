@@ -8,22 +8,23 @@ from dataclasses import replace
 import numpy as np
 
 from pipeprog_camera.errors import InputError
-from pipeprog_detect import background, classify, normals, octree
-from pipeprog_detect.abutment import abutted
-from pipeprog_detect.bill import Bill
+from pipeprog_detect.candidate_search import THICKEST_LINE, Report, Search, is_pipe
+from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
+from pipeprog_detect.cloud.cutting_planes import parse_planes
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.inside import find_concave
-from pipeprog_detect.lost import find_lost
-from pipeprog_detect.measured import Measured, joined
-from pipeprog_detect.memory import Memory
-from pipeprog_detect.occlusion import with_depths
-from pipeprog_detect.outline import viewing_direction
-from pipeprog_detect.pipe import Cloud, Cylinder, FloatArray, Pipe, View
-from pipeprog_detect.planes import parse_planes
-from pipeprog_detect.refinement import Jury
-from pipeprog_detect.search import THICKEST_LINE, Report, Search, is_pipe
-from pipeprog_detect.support import own_outlines
-from pipeprog_detect.surroundings import Surroundings
+from pipeprog_detect.interior_search import find_concave
+from pipeprog_detect.product import classification
+from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.silhouette.apparent_contour import viewing_direction
+from pipeprog_detect.silhouette.edge_support import own_outlines
+from pipeprog_detect.silhouette.occlusion import with_depths
+from pipeprog_detect.thin.thin_pipes import find_lost
+from pipeprog_detect.types import Cloud, Cylinder, FloatArray, Pipe, View
+from pipeprog_detect.verification.keyframe_verifier import Jury
+from pipeprog_detect.verification.measured_pipe import Measured, joined
+from pipeprog_detect.verification.measurement_cache import Memory
+from pipeprog_detect.verification.scene_context import Surroundings
+from pipeprog_detect.verification.wall_ends import abutted
 
 # Stereo is rougher on pipes, curved and glossy, than on the walls that the noise is read from.
 _STEREO_ON_PIPES = 2.0
@@ -59,10 +60,10 @@ def detect(
     report(0.0, "sorting points")
     tree = octree.build(points)
     report(0.1, "estimating noise")
-    sigma = normals.estimate_noise(tree)
+    sigma = local_shape.estimate_noise(tree)
     widest = 1.5 * max(planned.outer_radius for planned in bill.classes)
     report(0.15, "finding walls")
-    walls, on_plane = background.find_planes(tree, sigma, widest)
+    walls, on_plane = plane_segmentation.find_planes(tree, sigma, widest)
     plain = tree.subset(on_plane)
     plain = plain.thinned(plain.level_of(_WALL_SPACING))
     tree = tree.subset(~on_plane)
@@ -140,12 +141,12 @@ def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
 def _product(measured: Sequence[Measured], bill: Bill, shift: FloatArray, config: DetectConfig) -> list[Pipe]:
     """The classified pipes in the frame that the cloud came in."""
     pipes = _numbered([_pipe(each, bill, shift, config.concave) for each in measured])
-    return classify.reclassified(pipes, bill, config.concave) if config.classifier == "kmeans" else pipes
+    return classification.reclassified(pipes, bill, config.concave) if config.classifier == "kmeans" else pipes
 
 
 def _pipe(measured: Measured, bill: Bill, shift: FloatArray, concave: bool) -> Pipe:
     candidate, cylinder, sigma = measured.candidate, measured.cylinder, measured.radius_sigma
-    verdict = classify.classify(cylinder.radius, sigma, bill, concave)
+    verdict = classification.classify(cylinder.radius, sigma, bill, concave)
     return Pipe(
         "",
         _shifted(cylinder, shift),

@@ -19,11 +19,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.bill import Bill, load_bill
-from pipeprog_detect.classify import ClassProgress
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
-from pipeprog_detect.pipe import Pipe
+from pipeprog_detect.product.boq import Bill, load_bill
+from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
+from pipeprog_detect.types import Pipe
 from pipeprog_detect.worker import Keyframe, Map, PipesReady, serve
 from pipeprog_msgs import msg, srv
 from pipeprog_node import messages, qos

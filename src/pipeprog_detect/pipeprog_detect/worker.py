@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.bill import Bill
-from pipeprog_detect.classify import ClassProgress, progress
+from pipeprog_detect.cloud.map_change import Novelty
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.identity import Identities
-from pipeprog_detect.keyframes import Keyframes
-from pipeprog_detect.memory import Memory
-from pipeprog_detect.novelty import Novelty
-from pipeprog_detect.pipe import Cloud, Pipe
+from pipeprog_detect.keyframe_cache import Keyframes
+from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.classification import ClassProgress, progress
+from pipeprog_detect.product.pipe_tracker import Identities
+from pipeprog_detect.types import Cloud, Pipe
+from pipeprog_detect.verification.measurement_cache import Memory
 
 
 @dataclass(frozen=True)

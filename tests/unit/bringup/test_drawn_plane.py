@@ -12,7 +12,7 @@ from pipeprog_bringup.drawn_plane import as_points
 from pipeprog_bringup.results import write_trajectory
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.planes import parse_planes
+from pipeprog_detect.cloud.cutting_planes import parse_planes
 from tests.unit.bringup.recordings import START, STEP, image, info, write_bag
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, "plumb_bob", (-0.2, 0.05, 0.001, -0.002, 0.0))

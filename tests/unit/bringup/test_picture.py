@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeprog_bringup.picture import ColoredPipe, draw
-from pipeprog_detect.pipe import Cylinder
+from pipeprog_detect.types import Cylinder
 
 AHEAD = np.array([0.0, -1.0, 0.2])
 

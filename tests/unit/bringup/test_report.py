@@ -14,8 +14,8 @@ from pipeprog_bringup import picture, results
 from pipeprog_bringup.cloud_io import write_ply
 from pipeprog_bringup.report import report
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.classify import ClassProgress
-from pipeprog_detect.pipe import Cylinder, Pipe
+from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.types import Cylinder, Pipe
 
 DAY = 86_400 * 10**9
 START = 1_700_000_000 * 10**9

@@ -15,8 +15,8 @@ from pipeprog_bringup.frame_log import FrameLog
 from pipeprog_bringup.output import OutputFolder
 from pipeprog_bringup.overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.classify import ClassProgress
-from pipeprog_detect.pipe import Cylinder, Pipe
+from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.types import Cylinder, Pipe
 
 PIPE = Pipe(
     "p03",

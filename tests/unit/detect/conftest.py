@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.pipe import Cylinder, View
+from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, WALL
 
 SAMPLES = 2

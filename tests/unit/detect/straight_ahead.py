@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.pipe import View
+from pipeprog_detect.types import View
 
 CAMERA = Camera(480, 270, 345.0, 345.0, 239.5, 134.5)
 

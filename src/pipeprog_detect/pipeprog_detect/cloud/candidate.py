@@ -1,0 +1,324 @@
+"""From a hypothesis to a measured cylinder with the evidence for and against it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_detect.cloud.axial_extent import Run, straight_stretch, surface_runs
+from pipeprog_detect.cloud.axis_voting import Hypothesis, Sector
+from pipeprog_detect.cloud.cylinder_fit import CylinderFit, basis, covered_arc, fit_cylinder
+from pipeprog_detect.cloud.octree import Octree
+from pipeprog_detect.types import Cylinder, FloatArray
+
+_FIT_POINTS = 2500
+# Where a pipe goes on is seen on some of its points as well as on all.
+_FOLLOW_POINTS = 20_000
+_FINAL_POINTS = 12000
+# Noise above this share of the radius blurs half a circle into a blob whose circle fit is far too small.
+_BLURRED = 0.16
+# Clouds are bent by about a millimetre over decimetres; a fifth of that remains on the radius [m].
+_BENT_CLOUD = 2e-4
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for and against a cylinder.
+
+    arc [rad]: widest stretch of the circumference seen; coverage: share of the length that shows surface; inside:
+    points within the barrel, well under its surface, per point on it; noise [m]: spread of the points across the
+    surface; roundness [m]: root mean square over the sectors of the section of their mean distance from the circle,
+    0 for a true one; flatness: mean square from the best plane over the mean square from the cylinder.
+    """
+
+    arc: float
+    coverage: float
+    inside: float
+    noise: float
+    roundness: float
+    flatness: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A measured cylinder, standard deviation of its radius [m], points on its surface, stretches seen, evidence."""
+
+    cylinder: Cylinder
+    radius_sigma: float
+    points: int
+    runs: list[Run]
+    evidence: Evidence
+
+    @property
+    def blurred(self) -> bool:
+        """Whether the noise hides the section: a thin pipe and the edge of a plate look the same."""
+        return self.evidence.noise > _BLURRED * self.cylinder.radius
+
+    @property
+    def band(self) -> float:
+        """Width [m] that counts as one standard deviation when points are taken for its surface."""
+        return 1.2 * self.evidence.noise + 2e-4
+
+
+def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma: float) -> Candidate | None:
+    """Fit a hypothesis to the points of the tree that are free (N,), and follow it along its axis to its ends.
+
+    Only the sector that voted for it is fitted: beside it a neighbour may begin, which is not known yet.
+    sigma [m] is the cloud's typical noise; a pipe's own may be up to 1.6 times that (head-on surfaces, waviness).
+    """
+    wide = 1.2 * sigma + 5e-4
+    initial = cylinder = hypothesis.cylinder
+    for turn in range(12):
+        axis = cylinder.axis
+        step = max(0.5 * cylinder.length, 0.25, 4.0 * cylinder.radius) if turn else 0.0
+        # Hypotheses are right to a tenth of the radius; a wider reach would take in the neighbour of a rack.
+        reach = 1.0 + 0.1 * cylinder.radius / wide if turn == 0 else 1.2
+        rows = tree.near_segment(
+            cylinder.start - step * axis, cylinder.end + step * axis, cylinder.radius + 4.0 * wide * reach
+        )
+        points = _spread_out(tree.points[rows[free[rows]]], _FOLLOW_POINTS)
+        if len(points) < 30:
+            return None
+        grown = np.inf
+        if turn:
+            runs = _seen_runs(points, cylinder, wide)
+            if not runs:
+                return None
+            low, high = runs[0].low, runs[-1].high
+            grown = max(-low, high - cylinder.length)
+            cylinder = _cut(cylinder, low, high)
+            points = _within(points, cylinder, Run(0.0, cylinder.length))
+        facing = _spread_out(_facing(points, cylinder, hypothesis.sector), _FIT_POINTS)
+        fit = fit_cylinder(facing, cylinder, wide, reach=reach, along_ray=False)
+        if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
+            return None
+        wide = float(np.clip(1.2 * fit.rmse, 0.7 * sigma + 3e-4, 1.6 * sigma + 7e-4))
+        cylinder = fit.cylinder if turn == 0 else _between(fit.cylinder, cylinder)
+        if grown < 0.02 and turn >= 2:
+            break
+    margin = cylinder.radius * cylinder.axis
+    rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, 1.5 * cylinder.radius + 6.0 * wide)
+    return settle(tree.points[rows[free[rows]]], cylinder, wide, sector=hypothesis.sector)
+
+
+def settle(
+    points: FloatArray, cylinder: Cylinder, wide: float, whole: bool = False, sector: Sector | None = None
+) -> Candidate | None:
+    """Measure a cylinder that is nearly right on the points (N, 3) around it, all of which are its own or nobody's.
+
+    Points within three times `wide` [m] are its surface. A `whole` cylinder is known to be one pipe between its ends,
+    whatever the gaps; otherwise it is followed as far as it is straight and its gaps are such as a clamp explains.
+    Where a sector is given, only that is fitted.
+    """
+    near = points[np.abs(_signed_distance(points, cylinder)) < max(5.0 * wide, 0.2 * cylinder.radius)]
+    # A cap closes the end: its points lie within the barrel all around, and would draw the radius in.
+    body = _facing(_within(near, cylinder, _without_caps(cylinder, wide)), cylinder, sector)
+    fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), cylinder, wide, reach=1.0)
+    if fit is None:
+        return None
+    # What the residuals do not show: third orders of the noise, and a bend of the cloud that is alike all along.
+    radius_sigma = float(np.linalg.norm([fit.radius_sigma, 0.5 * fit.rmse**2 / fit.cylinder.radius, _BENT_CLOUD]))
+    if fit.rmse > _BLURRED * cylinder.radius:
+        fit, radius_sigma = _by_width(body, cylinder, fit, wide)
+    cylinder = _between(fit.cylinder, cylinder)
+    runs = _shown_runs(near, cylinder, wide) if whole else _seen_runs(near, cylinder, wide)
+    if not runs:
+        return None
+    cut = _cut(cylinder, runs[0].low, runs[-1].high)
+    runs = [Run(run.low - runs[0].low, run.high - runs[0].low) for run in runs]
+    surface = _within(near, cut, Run(0.0, cut.length))
+    surface = surface[np.abs(_signed_distance(surface, cut)) < 3.0 * wide]
+    if len(_within(surface, cut, _without_caps(cut, wide))) < 30:
+        return None
+    return Candidate(cut, radius_sigma, len(surface), runs, _evidence(points, cut, runs, surface, wide))
+
+
+def thin_start(
+    tree: Octree, free: NDArray[np.bool_], line: Cylinder, sigma: float, radii: Sequence[float]
+) -> Cylinder | None:
+    """The cylinder, of those of the given radii about a line through the points of a thin pipe, that explains most.
+
+    The line runs through the mean of the points, that is before the axis by about half a radius on a side that is
+    not known: each of eight sides is tried.
+    """
+    u, v = basis(line.axis)
+    rows = tree.near_segment(line.start, line.end, 2.5 * max(radii) + 4.0 * sigma)
+    points = _spread_out(tree.points[rows[free[rows]]], 1500)
+    best, most = None, 0.0
+    for radius in radii:
+        for angle in np.arange(8) * (np.pi / 4):
+            shift = 0.6 * radius * (np.cos(angle) * u + np.sin(angle) * v)
+            initial = Cylinder(line.start + shift, line.end + shift, radius)
+            fit = fit_cylinder(points, initial, sigma, reach=1.0, along_ray=False)
+            if fit is None or not 0.5 * min(radii) < fit.cylinder.radius < 1.5 * max(radii):
+                continue
+            share = np.clip(1.0 - (_signed_distance(points, fit.cylinder) / (4.0 * sigma)) ** 2, 0.0, None)
+            worth = float((share**2).sum())
+            if worth > most:
+                best, most = fit.cylinder, worth
+    return best
+
+
+def own_points(points: FloatArray, cylinder: Cylinder, others: Sequence[Cylinder]) -> FloatArray:
+    """The points (N, 3) that lie no nearer to the surface of one of the others than to the cylinder's."""
+    mine = np.abs(_signed_distance(points, cylinder))
+    keep = np.ones(len(points), bool)
+    for other in others:
+        along = (points - other.start) @ other.axis
+        theirs = _signed_distance(points, other)
+        # What lies within another barrel is its too: nothing passes through a pipe.
+        keep &= ~((along > 0) & (along < other.length) & (theirs < mine))
+    return points[keep]
+
+
+def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: float) -> tuple[CylinderFit, float]:
+    """Fit at the radius that the width of a blurred pipe's points tells, and that radius's standard deviation [m].
+
+    Over a half of the circumference seen, up to 70 or 75 deg from the front, the points' coordinate across has a
+    variance of 0.31 r^2 where a scanner's rays meet it (evenly over the width) and of 0.40 r^2 where the points lie
+    evenly on the surface; the noise across the ray, a third of that along it for a scanner, as much for a fused
+    cloud, adds to that. Both are taken in between.
+    """
+    axis = fit.cylinder.axis
+    offset = points - fit.cylinder.start
+    lateral = offset - (offset @ axis)[:, None] * axis
+    near = lateral[np.linalg.norm(lateral, axis=1) < 2.0 * cylinder.radius + 2.0 * wide]
+    if len(near) < 50:
+        return fit, fit.cylinder.radius
+    for _ in range(3):
+        centred = near - np.median(near, axis=0)
+        values, vectors = np.linalg.eigh(centred.T @ centred / len(centred))
+        along = centred @ vectors[:, 2]
+        near = near[np.abs(along) < 2.5 * np.sqrt(values[2])]
+    noise = 0.65 * fit.rmse
+    square = max(float(values[2]) - noise**2, 0.25 * float(values[2]))
+    radius = float(np.sqrt(square / 0.355))
+    again = fit_cylinder(
+        _spread_out(points, _FINAL_POINTS), replace(cylinder, radius=radius), wide, reach=1.0, fixed_radius=radius
+    )
+    # The share of the noise across is known to a third of it; a part hidden takes up to a fifth off the width.
+    sigma = float(np.hypot(0.1 * radius, 1.5 * 0.5 * noise**2 / radius))
+    return (again or fit), sigma
+
+
+def _evidence(points: FloatArray, cylinder: Cylinder, runs: list[Run], surface: FloatArray, wide: float) -> Evidence:
+    body = _without_caps(cylinder, wide)
+    surface = _within(surface, cylinder, body)
+    distance = _signed_distance(surface, cylinder)
+    inside = float((_signed_distance(_within(points, cylinder, body), cylinder) < -4.0 * wide).sum()) / len(surface)
+    offset = surface - surface.mean(axis=0)
+    lateral = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+    values = np.linalg.eigvalsh(lateral.T @ lateral / len(lateral))
+    square = float(np.mean(distance**2))
+    return Evidence(
+        arc=covered_arc(surface, cylinder),
+        coverage=sum(run.length for run in runs) / cylinder.length,
+        inside=inside,
+        noise=float(np.sqrt(square)),
+        roundness=_roundness(surface, cylinder, distance),
+        flatness=float(values[1]) / max(square, 1e-12),
+    )
+
+
+def _roundness(points: FloatArray, cylinder: Cylinder, distance: FloatArray, sectors: int = 36) -> float:
+    u, v = basis(cylinder.axis)
+    offset = points - cylinder.start
+    sector = ((np.arctan2(offset @ v, offset @ u) + np.pi) * (sectors / (2 * np.pi))).astype(int) % sectors
+    count = np.bincount(sector, minlength=sectors)
+    mean = np.bincount(sector, weights=distance, minlength=sectors) / np.maximum(count, 1)
+    # What the noise of a sector's mean adds is taken out.
+    own = np.var(distance) / np.maximum(count, 1)
+    square = np.average(mean**2 - own, weights=count)
+    return float(np.sqrt(max(square, 0.0)))
+
+
+def _facing(points: FloatArray, cylinder: Cylinder, sector: Sector | None) -> FloatArray:
+    if sector is None:
+        return points
+    offset = points - cylinder.start
+    radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+    return points[radial @ sector.front > np.cos(sector.half) * np.linalg.norm(radial, axis=1)]
+
+
+def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
+    offset = points - cylinder.start
+    along = offset @ cylinder.axis
+    square = np.einsum("ij,ij->i", offset, offset) - along**2
+    return np.asarray(np.sqrt(np.maximum(square, 0.0)) - cylinder.radius)
+
+
+def _seen_runs(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Run]:
+    """Stretches of the axis that show surface and lie on one line, without an elbow at an end."""
+    distance = np.abs(_signed_distance(points, cylinder))
+    skin = distance < 3.0 * wide
+    if skin.sum() < 30:
+        return []
+    # An elbow that leaves a narrow band shows its front only, which does not tell where it went.
+    straight = straight_stretch(points[distance < max(3.0 * wide, 0.2 * cylinder.radius)], cylinder, wide)
+    if straight is None:
+        return []
+    return _connected(
+        surface_runs(_within(points[skin], cylinder, straight), cylinder),
+        _longest_gap(cylinder.radius),
+        cylinder.radius,
+    )
+
+
+def _shown_runs(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Run]:
+    """Stretches between the cylinder's ends that show surface."""
+    skin = points[np.abs(_signed_distance(points, cylinder)) < 3.0 * wide]
+    runs = surface_runs(_within(skin, cylinder, Run(0.0, cylinder.length)), cylinder)
+    return [run for run in runs if run.length > max(0.5 * cylinder.radius, 0.015)]
+
+
+def _longest_gap(radius: float) -> float:
+    """Gap [m] in the surface that a clamp, a flange or an occluder explains."""
+    return max(10.0 * radius, 0.3)
+
+
+def _connected(runs: list[Run], gap: float, radius: float) -> list[Run]:
+    """The runs that belong together: from the longest one outwards, a short piece beyond a long gap left out."""
+    runs = [run for run in runs if run.length > max(0.5 * radius, 0.015)]
+    if not runs:
+        return []
+    first = last = int(np.argmax([run.length for run in runs]))
+    while first > 0 and _bridged(runs[first - 1], runs[first].low - runs[first - 1].high, gap, radius):
+        first -= 1
+    while last + 1 < len(runs) and _bridged(runs[last + 1], runs[last + 1].low - runs[last].high, gap, radius):
+        last += 1
+    return runs[first : last + 1]
+
+
+def _bridged(run: Run, gap: float, most: float, radius: float) -> bool:
+    return gap < min(most, max(4.0 * run.length, radius))
+
+
+def _cut(cylinder: Cylinder, low: float, high: float) -> Cylinder:
+    return Cylinder(cylinder.start + low * cylinder.axis, cylinder.start + high * cylinder.axis, cylinder.radius)
+
+
+def _between(line: Cylinder, ends: Cylinder) -> Cylinder:
+    """The cylinder `line` with the ends of another one, projected."""
+    axis = line.axis
+    low, high = float((ends.start - line.start) @ axis), float((ends.end - line.start) @ axis)
+    return _cut(line, min(low, high), max(low, high))
+
+
+def _without_caps(cylinder: Cylinder, wide: float) -> Run:
+    cap = min(5.0 * wide + 0.015, 0.2 * cylinder.length)
+    return Run(cap, cylinder.length - cap)
+
+
+def _within(points: FloatArray, cylinder: Cylinder, run: Run) -> FloatArray:
+    along = (points - cylinder.start) @ cylinder.axis
+    return points[(along >= run.low) & (along <= run.high)]
+
+
+def _spread_out(points: FloatArray, most: int) -> FloatArray:
+    """At most `most` of the points, evenly along the Morton curve and so in space."""
+    if len(points) <= most:
+        return points
+    return points[np.linspace(0, len(points) - 1, most).astype(np.int64)]

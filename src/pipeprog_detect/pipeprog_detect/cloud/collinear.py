@@ -1,0 +1,95 @@
+"""How cylinders belong together: pieces of one pipe on one line, elbows between two pipes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeprog_detect.types import Cylinder, FloatArray
+
+# Pieces of one pipe: axes within this angle, offset by this share of the radius (and what waviness may add
+# off), radii within this ratio.
+_ANGLE = np.radians(2.0)
+_OFFSET = 0.25
+_RATIO = 1.12
+_LEAST_OFFSET = 4e-3
+
+
+def near(one: Cylinder, other: Cylinder, reach: float) -> bool:
+    """Whether the axes of two cylinders come nearer than their radii and `reach` [m]."""
+    allowed = one.radius + other.radius + reach
+    apart = float(np.linalg.norm(0.5 * (one.start + one.end - other.start - other.end)))
+    if apart > 0.5 * (one.length + other.length) + allowed:
+        return False
+    return _axis_distance(one, other) < allowed
+
+
+def join(cylinders: Sequence[Cylinder]) -> list[list[int]]:
+    """Groups of the cylinders that are pieces of one pipe, in the order of their first members.
+
+    Two pieces are one pipe where axis and radius agree and the gap is one that fittings, clamps and occluders make:
+    up to ten radii or 30 cm, or up to the shorter piece's length where the axes agree closely.
+    """
+    group = list(range(len(cylinders)))
+    for i, one in enumerate(cylinders):
+        for j in range(i + 1, len(cylinders)):
+            if group[i] != group[j] and _one_pipe(one, cylinders[j]):
+                old, new = max(group[i], group[j]), min(group[i], group[j])
+                group = [new if member == old else member for member in group]
+    return [[k for k in range(len(cylinders)) if group[k] == first] for first in sorted(set(group))]
+
+
+def spanning(pieces: Sequence[Cylinder], best: int) -> Cylinder:
+    """One cylinder from end to end of collinear pieces, with the radius of the best; its axis joins the far ends."""
+    if len(pieces) == 1:
+        return pieces[0]
+    axis = pieces[best].axis
+    ends = np.array([end for piece in pieces for end in (piece.start, piece.end)])
+    along = (ends - pieces[best].start) @ axis
+    return Cylinder(ends[int(np.argmin(along))], ends[int(np.argmax(along))], pieces[best].radius)
+
+
+def elbows(cylinders: Sequence[Cylinder]) -> set[int]:
+    """Which cylinders are the middle of an elbow: short, beside an end of a longer one as thick, at an angle to it."""
+    found = set()
+    for i, one in enumerate(cylinders):
+        if one.length > 6.0 * one.radius:
+            continue
+        for other in cylinders:
+            if other.length < 1.5 * one.length or not 0.8 < one.radius / other.radius < 1.25:
+                continue
+            cosine = abs(float(one.axis @ other.axis))
+            touch = min(float(np.linalg.norm(a - b)) for a in (one.start, one.end) for b in (other.start, other.end))
+            if np.cos(np.radians(75.0)) < cosine < np.cos(np.radians(8.0)) and touch < 2.5 * one.radius:
+                found.add(i)
+    return found
+
+
+def _one_pipe(one: Cylinder, other: Cylinder) -> bool:
+    if not 1.0 / _RATIO < one.radius / other.radius < _RATIO:
+        return False
+    shorter, longer = sorted((one, other), key=lambda cylinder: cylinder.length)
+    radius = longer.radius
+    if abs(float(shorter.axis @ longer.axis)) < np.cos(max(_ANGLE, 0.5 * radius / shorter.length)):
+        return False
+    along = np.array([(end - longer.start) @ longer.axis for end in (shorter.start, shorter.end)])
+    gap = max(float(along.min()) - longer.length, -float(along.max()))
+    facing = (shorter.start, shorter.end)[int(np.argmin(np.abs(along - 0.5 * longer.length)))]
+    aside = facing - longer.start
+    offset = float(np.linalg.norm(aside - (aside @ longer.axis) * longer.axis))
+    if offset > _OFFSET * radius + _LEAST_OFFSET:
+        return False
+    close = offset < 0.5 * _OFFSET * radius + _LEAST_OFFSET
+    return gap < max(10.0 * radius, 0.3, max(shorter.length, 15.0 * radius) if close else 0.0)
+
+
+def _axis_distance(one: Cylinder, other: Cylinder, steps: int = 9) -> float:
+    """Least distance [m] of points along one axis from the other's segment."""
+    share = np.linspace(0.0, 1.0, steps)[:, None]
+    best = np.inf
+    for a, b in ((one, other), (other, one)):
+        points: FloatArray = a.start + share * (a.end - a.start)
+        along = np.clip((points - b.start) @ b.axis, 0.0, b.length)
+        best = min(best, float(np.linalg.norm(points - b.start - along[:, None] * b.axis, axis=1).min()))
+    return best

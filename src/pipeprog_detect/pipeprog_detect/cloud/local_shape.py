@@ -1,0 +1,273 @@
+"""Local surface shape: normal, principal curvature and its direction from a quadric around each site."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numba import njit
+
+from pipeprog_detect.cloud.octree import THREADS, IntArray, Octree, neighbour_runs
+from pipeprog_detect.types import FloatArray
+
+# A quadric has six coefficients: twice as many points leave something to judge it by.
+_LEAST_POINTS = 12
+# Root of the Tukey-weighted mean square of Gaussian residuals, cut at four sigma, in sigmas.
+_TUKEY_SHRINKAGE = 0.873
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Shape of the cloud around S sites within `scale` [m]; rows with count 0 have too few points.
+
+    centres (S, 3): the mean of the neighbours; feet (S, 3): the fitted surface at the site; normals (S, 3), sign
+    arbitrary; directions (S, 3): of least curvature; curvature (S,) [1/m]: the greater principal one, positive where
+    the surface bends towards -normal; second (S,): the other; sigma (S,): its standard deviation by the noise;
+    rms (S,) [m] of the residuals and inliers (S,): their share; spread (S, 3): standard deviations [m] of the
+    neighbours along their principal directions, ascending; line (S, 3): the direction of greatest spread.
+    """
+
+    scale: float
+    sites: FloatArray
+    centres: FloatArray
+    feet: FloatArray
+    normals: FloatArray
+    directions: FloatArray
+    curvature: FloatArray
+    second: FloatArray
+    sigma: FloatArray
+    rms: FloatArray
+    inliers: FloatArray
+    spread: FloatArray
+    line: FloatArray
+    count: IntArray
+
+
+def surfaces(tree: Octree, sites: Octree, scale: float, sigma: float) -> Surfaces:
+    """Fit a quadric to the points of `tree` within `scale` [m] of each site; `sigma` [m] is the cloud's noise.
+
+    The residuals are weighted by Tukey's function at the known noise, so a second surface near by drops out.
+    Sites whose neighbours are flat within the noise get curvature 0 without a quadric.
+    """
+    level = tree.level_of(scale)
+    if tree.quantum * 2.0**level < scale:
+        level += 1
+    cells = tree.cells(level)
+    own_cells = sites.keys >> (3 * level)
+
+    def fit(part: slice) -> tuple[FloatArray, IntArray]:
+        return _fit_sites(
+            sites.points[part], own_cells[part], tree.points, cells.keys, cells.starts, level, scale, sigma
+        )
+
+    # The compiled loop lets other threads run.
+    bounds = np.linspace(0, len(sites.points), THREADS + 1).astype(int)
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = list(pool.map(fit, [slice(first, last) for first, last in pairwise(bounds)]))
+    table, count = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return Surfaces(
+        scale,
+        sites.points,
+        table[:, 0:3],
+        table[:, 3:6],
+        table[:, 6:9],
+        table[:, 9:12],
+        table[:, 12],
+        table[:, 13],
+        table[:, 14],
+        table[:, 15],
+        table[:, 16],
+        table[:, 17:20],
+        table[:, 20:23],
+        count,
+    )
+
+
+def estimate_noise(tree: Octree, most_cells: int = 20000) -> float:
+    """Standard deviation [m] of the points across the surfaces: the median over small patches of a quadric's residual.
+
+    The patches are cells of 3 cm, or larger where the cloud is too thin to fill them; edges and double surfaces are
+    few and only lengthen the upper tail. Where no patch tells, it is what the tree rounds the points to, and no less.
+    """
+    for level in range(tree.level_of(0.03), tree.level_of(1.0) + 1):
+        cells = tree.cells(level)
+        full = np.flatnonzero(cells.counts >= 2 * _LEAST_POINTS)
+        if len(full) >= 20 and cells.counts[full].sum() > 0.2 * len(tree.points):
+            break
+    else:
+        return tree.quantum
+    chosen: IntArray = full[:: max(1, len(full) // most_cells)]
+    residual = _patch_residuals(tree.points, cells.starts[chosen], cells.starts[chosen + 1], cells.size)
+    clean = residual[residual > 0]
+    return max(float(np.median(clean)) / _TUKEY_SHRINKAGE, tree.quantum) if len(clean) else tree.quantum
+
+
+@njit(cache=True, nogil=True)
+def _quadric_rows(offset: FloatArray, frame: FloatArray, scale: float) -> tuple[float, float, float]:
+    x = (offset[0] * frame[0, 0] + offset[1] * frame[0, 1] + offset[2] * frame[0, 2]) / scale
+    y = (offset[0] * frame[1, 0] + offset[1] * frame[1, 1] + offset[2] * frame[1, 2]) / scale
+    z = (offset[0] * frame[2, 0] + offset[1] * frame[2, 1] + offset[2] * frame[2, 2]) / scale
+    return x, y, z
+
+
+@njit(cache=True, nogil=True)
+def _principal(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean, standard deviations ascending, and principal directions as rows (normal first)."""
+    mean = np.zeros(3)
+    for i in range(len(points)):
+        mean += points[i]
+    mean /= len(points)
+    scatter = np.zeros((3, 3))
+    for i in range(len(points)):
+        for a in range(3):
+            for b in range(a, 3):
+                scatter[a, b] += (points[i, a] - mean[a]) * (points[i, b] - mean[b])
+    for a in range(3):
+        for b in range(a):
+            scatter[a, b] = scatter[b, a]
+    values, vectors = np.linalg.eigh(scatter / len(points))
+    return mean, np.sqrt(np.maximum(values, 0.0)), np.ascontiguousarray(vectors.T)
+
+
+@njit(cache=True, nogil=True)
+def _solve_quadric(
+    points: FloatArray, origin: FloatArray, frame: FloatArray, scale: float, sigma: float, rounds: int
+) -> tuple[FloatArray, float, float, float]:
+    """Weighted z = q . (1, x, y, xx, xy, yy) in units of scale; returns q, rms [m], inlier share, variance of xx."""
+    q: FloatArray = np.zeros(6)
+    rms, share, variance = 0.0, 0.0, 0.0
+    row = np.empty(6)
+    for turn in range(rounds):
+        normal = np.zeros((6, 6))
+        right = np.zeros(6)
+        # Four sigma after a first plain round; wide at first, since the plane is not yet the surface.
+        reach = 4.0 * sigma * (2.0 if turn == 1 else 1.0) / scale
+        total, square, weights = 0, 0.0, 0.0
+        for i in range(len(points)):
+            x, y, z = _quadric_rows(points[i] - origin, frame, scale)
+            row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, x, y, x * x, x * y, y * y
+            weight = 1.0
+            if turn > 0:
+                d = z
+                for a in range(6):
+                    d -= q[a] * row[a]
+                t = d / reach
+                if t * t >= 1.0:
+                    continue
+                weight = (1.0 - t * t) ** 2
+                square += weight * d * d
+                weights += weight
+            total += 1
+            for a in range(6):
+                right[a] += weight * row[a] * z
+                for b in range(a, 6):
+                    normal[a, b] += weight * row[a] * row[b]
+        if total < 8:
+            return q, 0.0, 0.0, 0.0
+        for a in range(6):
+            normal[a, a] += 1e-9 * total
+            for b in range(a):
+                normal[a, b] = normal[b, a]
+        inverse = np.linalg.inv(normal)
+        q = np.dot(inverse, right)
+        rms = scale * np.sqrt(square / max(weights, 1e-12))
+        share = total / len(points)
+        variance = max(inverse[3, 3], inverse[5, 5])
+    return q, rms, share, variance
+
+
+@njit(cache=True, nogil=True)
+def _fit_sites(
+    sites: FloatArray,
+    site_cells: IntArray,
+    points: FloatArray,
+    cell_keys: IntArray,
+    cell_starts: IntArray,
+    level: int,
+    scale: float,
+    sigma: float,
+) -> tuple[FloatArray, IntArray]:
+    table = np.zeros((len(sites), 23))
+    count = np.zeros(len(sites), np.int64)
+    runs = np.zeros((27, 2), np.int64)
+    found, last = 0, -1
+    buffer = np.empty((1024, 3))
+    for s in range(len(sites)):
+        if site_cells[s] != last:
+            last = site_cells[s]
+            found = neighbour_runs(last, cell_keys, cell_starts, level, runs)
+        n = 0
+        for r in range(found):
+            for i in range(runs[r, 0], runs[r, 1]):
+                dx = points[i, 0] - sites[s, 0]
+                dy = points[i, 1] - sites[s, 1]
+                dz = points[i, 2] - sites[s, 2]
+                if dx * dx + dy * dy + dz * dz <= scale * scale and n < len(buffer):
+                    buffer[n, 0] = points[i, 0]
+                    buffer[n, 1] = points[i, 1]
+                    buffer[n, 2] = points[i, 2]
+                    n += 1
+        if n < _LEAST_POINTS:
+            continue
+        near = buffer[:n]
+        mean, spread, axes = _principal(near)
+        out = table[s]
+        out[0:3] = mean
+        out[17:20] = spread
+        out[20:23] = axes[2]
+        out[6:9] = axes[0]
+        out[9:12] = axes[2]
+        out[3:6] = mean
+        out[15] = spread[0]
+        out[16] = 1.0
+        count[s] = n
+        # Flat within the noise: a curvature that matters would thicken the patch.
+        if spread[0] < 0.7 * sigma:
+            continue
+        frame = np.empty((3, 3))
+        frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
+        q, rms, share, variance = _solve_quadric(near, sites[s], frame, scale, sigma, 4)
+        out[15] = rms
+        out[16] = share
+        if share == 0.0:
+            continue
+        # Hessian of the height over the tangent plane, in 1/m.
+        hxx, hxy, hyy = 2.0 * q[3] / scale, q[4] / scale, 2.0 * q[5] / scale
+        half = 0.5 * np.sqrt((hxx - hyy) ** 2 + 4.0 * hxy * hxy)
+        mid = 0.5 * (hxx + hyy)
+        k1, k2 = mid + half, mid - half
+        angle = 0.5 * np.arctan2(2.0 * hxy, hxx - hyy)
+        if abs(k2) > abs(k1):
+            k1, k2 = k2, k1
+            angle += 0.5 * np.pi
+        slope = np.sqrt(1.0 + q[1] * q[1] + q[2] * q[2])
+        normal = (frame[2] - q[1] * frame[0] - q[2] * frame[1]) / slope
+        direction = -np.sin(angle) * frame[0] + np.cos(angle) * frame[1]
+        direction = direction - (direction @ normal) * normal
+        out[3:6] = sites[s] + q[0] * scale * frame[2]
+        out[6:9] = normal
+        out[9:12] = direction / np.sqrt(direction @ direction)
+        out[12] = -k1 / slope**3
+        out[13] = -k2 / slope**3
+        out[14] = 2.0 * np.sqrt(variance) * sigma / (scale * scale)
+    return table, count
+
+
+@njit(cache=True, nogil=True)
+def _patch_residuals(points: FloatArray, first: IntArray, last: IntArray, scale: float) -> FloatArray:
+    out = np.zeros(len(first))
+    for c in range(len(first)):
+        near = points[first[c] : last[c]]
+        mean, spread, axes = _principal(near)
+        # A sliver holds no quadric.
+        if spread[1] < 0.1 * scale:
+            continue
+        frame = np.empty((3, 3))
+        frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
+        wide = max(spread[0], 1e-6)
+        _, rms, share, _ = _solve_quadric(near, mean, frame, scale, wide, 3)
+        if share > 0.8:
+            out[c] = rms * np.sqrt(len(near) / max(len(near) - 6.0, 1.0))
+    return out

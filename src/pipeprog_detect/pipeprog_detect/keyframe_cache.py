@@ -1,0 +1,52 @@
+"""The keyframes of a survey as the detector wants them: grey, undistorted, decoded once while memory allows."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.camera import Camera
+from pipeprog_detect.types import FloatArray, View
+
+# Decoded images kept [bytes]: 550 of 720p, 60 of 4K.
+_MOST_BYTES = 512 * 2**20
+
+
+class Keyframes:
+    """Encoded keyframes by stamp, and the decoded ones that fit in memory."""
+
+    def __init__(self, most_bytes: int = _MOST_BYTES) -> None:
+        self._encoded: dict[int, tuple[bytes, Camera]] = {}
+        self._images: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
+        self._most_bytes = most_bytes
+
+    def __contains__(self, stamp: int) -> bool:
+        """Whether a keyframe of this stamp was added."""
+        return stamp in self._encoded
+
+    def add(self, stamp: int, encoded: bytes, camera: Camera) -> None:
+        """Takes a keyframe (JPEG or PNG bytes, stamp in ns)."""
+        self._encoded[stamp] = (encoded, camera)
+        self._images.pop(stamp, None)
+
+    def view(self, stamp: int, map_from_camera: FloatArray) -> View:
+        """The keyframe at its pose (4, 4); raises RuntimeError where it cannot be decoded."""
+        encoded, camera = self._encoded[stamp]
+        image = self._images.pop(stamp, None)
+        if image is None:
+            image = _decoded(stamp, encoded, camera)
+        self._images[stamp] = image
+        held = sum(other.nbytes for other in self._images.values())
+        while held > self._most_bytes and len(self._images) > 1:
+            held -= self._images.popitem(last=False)[1].nbytes
+        return View(stamp, image, camera.pinhole(), np.linalg.inv(map_from_camera).astype(float))
+
+
+def _decoded(stamp: int, encoded: bytes, camera: Camera) -> NDArray[np.uint8]:
+    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise RuntimeError(f"keyframe {stamp} has a pose but cannot be decoded")
+    return camera.undistort_image(np.asarray(image, np.uint8))

@@ -1,0 +1,210 @@
+"""The bill of quantities: which pipe classes are planned, how thick, how many metres."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import yaml
+
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.product.standard_sizes import find_size, nearest_name
+
+Color = tuple[float, float, float]
+
+# Outer radius is toleranced to about half a percent of the diameter either way (EN 10220), and paint adds to it.
+_RELATIVE_TOLERANCE = 0.01
+_LEAST_TOLERANCE = 1e-4
+
+NAMED_COLORS: dict[str, Color] = {
+    "black": (0.0, 0.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+    "brown": (0.65, 0.16, 0.16),
+    "cyan": (0.0, 1.0, 1.0),
+    "gray": (0.5, 0.5, 0.5),
+    "green": (0.0, 0.5, 0.0),
+    "grey": (0.5, 0.5, 0.5),
+    "lime": (0.0, 1.0, 0.0),
+    "magenta": (1.0, 0.0, 1.0),
+    "maroon": (0.5, 0.0, 0.0),
+    "navy": (0.0, 0.0, 0.5),
+    "olive": (0.5, 0.5, 0.0),
+    "orange": (1.0, 0.65, 0.0),
+    "pink": (1.0, 0.75, 0.8),
+    "purple": (0.5, 0.0, 0.5),
+    "red": (1.0, 0.0, 0.0),
+    "silver": (0.75, 0.75, 0.75),
+    "teal": (0.0, 0.5, 0.5),
+    "white": (1.0, 1.0, 1.0),
+    "yellow": (1.0, 1.0, 0.0),
+}
+# Colours by outer radius [m] of the paper's Figure 11, then others told apart from them.
+_FIGURE_11 = {0.0086: "magenta", 0.0365: "blue", 0.0575: "cyan", 0.0841: "green", 0.1095: "red", 0.1223: "yellow"}
+_OTHERS = ("orange", "purple", "lime", "brown", "teal", "pink", "navy", "olive", "maroon", "silver")
+
+# Sewer pipes of PVC (EN 1401) have walls of a 34th to a 41st of the diameter. A bill of sewers may also give the bores
+# themselves as its sizes, which are then made to half a percent.
+_WALL_SHARE, _WALL_SPREAD = 0.5 * (2 / 34 + 2 / 41), 0.004
+_BORE_TOLERANCE = 0.005
+
+_SIZE_KEYS = ("outer_radius_mm", "outer_diameter_mm", "size")
+_KEYS = ("name", *_SIZE_KEYS, "wall_mm", "planned_length_m", "color")
+
+
+@dataclass(frozen=True)
+class PipeClass:
+    """A planned class: outer radius and its tolerance (one standard deviation) [m], planned length [m], RGB in 0..1.
+
+    wall [m] is the thickness of its wall where the bill tells, of use to a camera inside.
+    """
+
+    name: str
+    outer_radius: float
+    planned_length: float
+    color: Color
+    tolerance: float
+    wall: float | None = None
+
+    @property
+    def bores(self) -> tuple[tuple[float, float], ...]:
+        """Radii that its inner surface may have, and their tolerances (one standard deviation) [m]."""
+        if self.wall is not None:
+            return ((self.outer_radius - self.wall, self.tolerance),)
+        return (
+            (self.outer_radius * (1.0 - _WALL_SHARE), self.outer_radius * _WALL_SPREAD),
+            (self.outer_radius, self.outer_radius * _BORE_TOLERANCE),
+        )
+
+
+@dataclass(frozen=True)
+class Bill:
+    """The planned classes, in the order of the file."""
+
+    classes: tuple[PipeClass, ...]
+
+
+def load_bill(path: str | Path) -> Bill:
+    """Read BOQ.yaml (`classes:` with name, planned_length_m, color and a size).
+
+    The size is outer_radius_mm, outer_diameter_mm or `size`, a standard one such as `DN50 steel` (see sizes).
+
+    Raises InputError, naming the file, the value and the remedy, for anything that is no bill.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the bill of quantities ({error.strerror}): check the path") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        line = " ".join(str(error).split())
+        raise InputError(f"{path}: is no YAML ({line}): write it as in the README's example") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds no mapping: a bill of quantities begins with 'classes:'")
+    _refuse_unknown(path, "the file", content, ("classes",))
+    entries = content.get("classes")
+    if not isinstance(entries, list) or not entries:
+        raise InputError(
+            f"{path}: classes is {entries!r}: list at least one class with name, radius and planned length"
+        )
+    classes: list[PipeClass] = []
+    for number, entry in enumerate(entries, start=1):
+        new = _read_class(path, f"class {number}", entry)
+        for old in classes:
+            if old.name == new.name:
+                raise InputError(
+                    f"{path}: class '{new.name}' is listed twice: keep one, or give the other its own name"
+                )
+            if math.isclose(old.outer_radius, new.outer_radius, rel_tol=1e-6):
+                raise InputError(
+                    f"{path}: classes '{old.name}' and '{new.name}' have the same outer radius "
+                    f"{1e3 * new.outer_radius:g} mm and cannot be told apart: merge them"
+                )
+        classes.append(new)
+    return Bill(_with_colors(path, classes, entries))
+
+
+def _read_class(path: Path, where: str, entry: object) -> PipeClass:
+    if not isinstance(entry, dict):
+        raise InputError(f"{path}: {where} is {entry!r}: write name, outer_radius_mm and planned_length_m")
+    name = entry.get("name")
+    if not isinstance(name, str | int | float) or isinstance(name, bool) or not str(name).strip():
+        raise InputError(f"{path}: {where} has the name {name!r}: give each class a name")
+    name = str(name).strip()
+    where = f"class '{name}'"
+    _refuse_unknown(path, where, entry, _KEYS)
+    radius, tolerance = _read_size(path, where, entry)
+    if "planned_length_m" not in entry:
+        raise InputError(f"{path}: {where} has no planned_length_m: give the metres that are planned")
+    length = _positive(path, where, "planned_length_m", entry["planned_length_m"])
+    wall = 1e-3 * _positive(path, where, "wall_mm", entry["wall_mm"]) if "wall_mm" in entry else None
+    if wall is not None and wall >= radius:
+        raise InputError(
+            f"{path}: {where}: wall_mm is {1e3 * wall:g}, more than the radius: write the wall's thickness"
+        )
+    return PipeClass(name, radius, length, (0.5, 0.5, 0.5), tolerance, wall)
+
+
+def _read_size(path: Path, where: str, entry: dict[str, object]) -> tuple[float, float]:
+    """Outer radius and its tolerance [m]."""
+    given = [key for key in _SIZE_KEYS if key in entry]
+    if len(given) != 1:
+        raise InputError(
+            f"{path}: {where} needs one of {', '.join(_SIZE_KEYS)}, not {' and '.join(given) if given else 'none'}"
+        )
+    value = entry[given[0]]
+    if given[0] == "size":
+        size = find_size(str(value))
+        if size is None:
+            raise InputError(f"{path}: {where}: unknown size '{value}': did you mean '{nearest_name(str(value))}'?")
+        return 0.5 * size.outer_diameter, 0.5 * size.tolerance
+    millimetres = _positive(path, where, given[0], value)
+    radius = 1e-3 * millimetres * (1.0 if given[0] == "outer_radius_mm" else 0.5)
+    return radius, max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE)
+
+
+def _positive(path: Path, where: str, key: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{path}: {where}: {key} is {value!r}: write a number")
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{path}: {where}: {key} is {value}: write a number above zero")
+    return float(value)
+
+
+def _refuse_unknown(path: Path, where: str, entry: dict[object, object], known: tuple[str, ...]) -> None:
+    for key in entry:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)
+            raise InputError(f"{path}: unknown key '{key}' in {where}: did you mean '{near[0]}'?")
+
+
+def _with_colors(path: Path, classes: list[PipeClass], entries: list[dict[str, object]]) -> tuple[PipeClass, ...]:
+    given = [
+        _read_color(path, new.name, entry["color"]) if "color" in entry else None
+        for new, entry in zip(classes, entries, strict=True)
+    ]
+    colors: list[Color | None] = []
+    for new, color in zip(classes, given, strict=True):
+        known = [name for radius, name in _FIGURE_11.items() if abs(radius - new.outer_radius) < 2e-4]
+        colors.append(color or (NAMED_COLORS[known[0]] if known else None))
+    spare = [NAMED_COLORS[name] for name in _OTHERS if NAMED_COLORS[name] not in colors]
+    missing = 0
+    done = []
+    for new, color in zip(classes, colors, strict=True):
+        if color is None:
+            color = spare[missing % len(spare)]
+            missing += 1
+        done.append(replace(new, color=color))
+    return tuple(done)
+
+
+def _read_color(path: Path, name: str, value: object) -> Color:
+    text = str(value).strip().lower()
+    if text in NAMED_COLORS:
+        return NAMED_COLORS[text]
+    if re.fullmatch(r"#[0-9a-f]{6}", text):
+        return (int(text[1:3], 16) / 255, int(text[3:5], 16) / 255, int(text[5:7], 16) / 255)
+    near = difflib.get_close_matches(text, NAMED_COLORS, n=1, cutoff=0.0)[0]
+    raise InputError(f"{path}: class '{name}': unknown color '{value}': did you mean '{near}'? #rrggbb is fine too")

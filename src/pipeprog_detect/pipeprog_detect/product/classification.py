@@ -1,0 +1,115 @@
+"""Which planned class a measured radius belongs to, or none; and how much of each class is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.types import FloatArray, Pipe
+
+# A pipe farther than this from every nominal radius, in standard deviations of measurement and make, is none of them.
+_REJECT = 4.0
+# Under this probability the class is ambiguous, and none is named.
+SURE = 0.95
+
+
+@dataclass(frozen=True)
+class ClassProgress:
+    """Progress of one class: metres planned and installed, percent of the plan."""
+
+    name: str
+    outer_radius: float
+    planned: float
+    installed: float
+    percent: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Class of a pipe, or None; posterior of the most probable class, 0 where no class is near.
+
+    Without a name and with a probability above 0 the measurement cannot tell two classes apart.
+    """
+
+    name: str | None
+    probability: float
+
+
+def classify(radius: float, sigma: float, bill: Bill, concave: bool = False) -> Verdict:
+    """Class of a pipe of `radius` +- `sigma` [m], whose inner surface it is where `concave`.
+
+    Nominal radii stay fixed; the likelihood is Gaussian with the measurement's and the manufacturer's variance, the
+    prior is even. A radius more than four standard deviations from every class has none, and one that two classes
+    explain is not guessed.
+    """
+    posterior = _posterior(radius, sigma, bill, concave)
+    best = int(np.argmax(posterior))
+    if not posterior[best] > 0.0:
+        return Verdict(None, 0.0)
+    probability = float(posterior[best])
+    return Verdict(bill.classes[best].name if probability >= SURE else None, probability)
+
+
+def is_planned(radius: float, sigma: float, bill: Bill) -> bool:
+    """Whether a pipe of `radius` +- `sigma` [m] may be of one of the bill's classes, or of one of several."""
+    return classify(radius, sigma, bill).probability > 0.0
+
+
+def by_kmeans(radii: Sequence[float], nominal: Sequence[float]) -> list[int]:
+    """Number of the class of each pipe as the paper has it: k-means over radii [m] whose means start at the nominal.
+
+    The means drift with what they gather and nothing is rejected, so a size that is not planned gets a class, too.
+    """
+    values, means = np.asarray(radii, float), np.asarray(nominal, float)
+    if not len(values):
+        return []
+    label = np.full(len(values), -1)
+    while True:
+        new = np.argmin(np.abs(values[:, None] - means), axis=1)
+        if (new == label).all():
+            return [int(number) for number in label]
+        label = new
+        means = np.array([values[label == k].mean() if (label == k).any() else means[k] for k in range(len(means))])
+
+
+def reclassified(pipes: Sequence[Pipe], bill: Bill, concave: bool = False) -> list[Pipe]:
+    """The pipes with the classes that k-means gives them, each with its posterior probability."""
+    numbers = by_kmeans([pipe.cylinder.radius for pipe in pipes], [planned.outer_radius for planned in bill.classes])
+    return [
+        replace(
+            pipe,
+            class_name=bill.classes[number].name,
+            class_probability=float(_posterior(pipe.cylinder.radius, pipe.radius_sigma, bill, concave)[number]),
+        )
+        for pipe, number in zip(pipes, numbers, strict=True)
+    ]
+
+
+def _posterior(radius: float, sigma: float, bill: Bill, concave: bool) -> FloatArray:
+    """Posterior of each class (K,), all 0 where none is near."""
+    number, nominal, tolerance = [], [], []
+    for k, planned in enumerate(bill.classes):
+        for size, spread in planned.bores if concave else ((planned.outer_radius, planned.tolerance),):
+            number.append(k)
+            nominal.append(size)
+            tolerance.append(spread)
+    variance = sigma**2 + np.array(tolerance) ** 2
+    distance = (radius - np.array(nominal)) ** 2 / variance
+    if distance.min() > _REJECT**2:
+        return np.zeros(len(bill.classes))
+    likely = -0.5 * distance - 0.5 * np.log(variance)
+    posterior = np.bincount(number, weights=np.exp(likely - likely.max()), minlength=len(bill.classes))
+    return np.asarray(posterior / posterior.sum())
+
+
+def progress(pipes: Sequence[Pipe], bill: Bill) -> list[ClassProgress]:
+    """Metres installed of each planned class, in the bill's order."""
+    table = []
+    for planned in bill.classes:
+        installed = float(sum(pipe.cylinder.length for pipe in pipes if pipe.class_name == planned.name))
+        percent = 100.0 * installed / planned.planned_length
+        table.append(ClassProgress(planned.name, planned.outer_radius, planned.planned_length, installed, percent))
+    return table

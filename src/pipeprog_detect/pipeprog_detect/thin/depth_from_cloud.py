@@ -1,0 +1,121 @@
+"""A thin pipe as it looks from where it is seen: its direction in the image is known well, its depth is the cloud's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_detect.silhouette.apparent_contour import camera_centre, inside
+from pipeprog_detect.types import Cylinder, FloatArray, View
+
+# The cloud beside a thin pipe is looked at as far as so many of its widths.
+RELIEF_REACH = 4.0
+# The cloud is looked for so far before and behind a proposed axis [m].
+LAID_REACH = 0.3
+# Behind a thin pipe the cloud shows more of the wall than of it: so many percent of the points there are its own.
+FRONT = 10.0
+# Stereo draws a thin pipe to the wall, never to the camera: of the places along it so many show how near it is.
+FOREMOST = 0.25
+
+
+def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
+    """Mean projection centre (3,) of the views that show the cylinder's middle, None where none does."""
+    middle = 0.5 * (cylinder.start + cylinder.end)
+    centres = [camera_centre(view) for view in views if inside(view, middle[None])[0]]
+    return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
+
+
+def covers(one: Cylinder, other: Cylinder, centre: FloatArray, radii: float) -> bool:
+    """Whether two cylinders look, from `centre`, like pieces of one: their depths are what is known worst.
+
+    Their lines of sight may pass so many radii beside each other.
+    """
+    axis, towards, side = _sight(one, centre)
+    ends = np.stack([other.start, other.end]) - centre
+    depth = float((one.start - centre) @ towards)
+    place = (ends @ axis) * depth / (ends @ towards) - float((one.start - centre) @ axis)
+    aside = (ends @ side) * depth / (ends @ towards)
+    gap = max(float(place.min()) - one.length, -float(place.max()))
+    in_front = float((ends @ towards).min()) > 0.5 * depth
+    return in_front and float(np.abs(aside).max()) < radii * one.radius and gap < 0.3
+
+
+def spanning(one: Cylinder, other: Cylinder, centre: FloatArray) -> Cylinder:
+    """The first cylinder made as long as both, seen from `centre`."""
+    axis, towards, _ = _sight(one, centre)
+    ends = np.stack([other.start, other.end]) - centre
+    depth = float((one.start - centre) @ towards)
+    place = (ends @ axis) * depth / (ends @ towards) - float((one.start - centre) @ axis)
+    low, high = min(float(place.min()), 0.0), max(float(place.max()), one.length)
+    return Cylinder(one.start + low * axis, one.start + high * axis, one.radius)
+
+
+def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, sloping: bool = True) -> Cylinder | None:
+    """The cylinder at the depth of the nearest points (N, 3) that it hides from `centre`; None where there are few.
+
+    Where these lie no nearer than those beside it they are the wall's: the cloud does not show the pipe there. Unless
+    it is `sloping` it keeps its direction.
+    """
+    axis, towards, side = _sight(cylinder, centre)
+    depth = float((cylinder.start - centre) @ towards)
+    offset = points - centre.astype(np.float32)
+    far = offset @ towards.astype(np.float32)
+    near = np.abs(far - depth) < LAID_REACH
+    offset, far = offset[near], far[near]
+    place = (offset @ axis.astype(np.float32)) * depth / far - float((cylinder.start - centre) @ axis)
+    aside = (offset @ side.astype(np.float32)) * depth / far
+    along = (place > 0) & (place < cylinder.length)
+    bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
+    cell = np.clip((place / cylinder.length * bins).astype(int), 0, bins - 1)
+    inner = along & (np.abs(aside) < 0.6 * cylinder.radius)
+    front = by_bin(cell[inner], far[inner], bins, FRONT)
+    flanks = []
+    for sign in (-1.0, 1.0):
+        beside = along & (sign * aside > 2.4 * cylinder.radius) & (sign * aside < 2.0 * RELIEF_REACH * cylinder.radius)
+        flanks.append(by_bin(cell[beside], far[beside], bins, FRONT))
+    known = np.isfinite(front) & ~(np.fmax(*flanks) - front < cylinder.radius)
+    if known.sum() < 0.3 * bins:
+        return None
+    at, inverse_front = (np.arange(bins)[known] + 0.5) / bins, 1.0 / front[known]
+    if sloping:
+        slope, level = robust_line(at, inverse_front)
+    else:
+        slope = float(1.0 / ((cylinder.end - centre) @ towards) - 1.0 / depth)
+        level = float(np.quantile(inverse_front - slope * at, 1.0 - FOREMOST))
+    inverse = np.array([level, level + slope])
+    if (np.abs(depth * inverse - 1.0) > LAID_REACH * inverse).any():
+        return None
+    ends = []
+    for end, share in ((cylinder.start, 0.0), (cylinder.end, 1.0)):
+        ray = end - centre
+        ends.append(centre + ray * (1.0 / (level + share * slope) + 0.5 * cylinder.radius) / float(ray @ towards))
+    return Cylinder(ends[0], ends[1], cylinder.radius)
+
+
+def by_bin(cell: NDArray[np.int64], depth: NDArray[np.float32], bins: int, percent: float) -> FloatArray:
+    """Percentile (B,) of the depths in each bin, NaN with fewer than three."""
+    result = np.full(bins, np.nan)
+    for one in range(bins):
+        members = depth[cell == one]
+        if len(members) >= 3:
+            result[one] = np.percentile(members, percent)
+    return result
+
+
+def robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Slope and value at 0 of the line through points (N,), by the median of the slopes of all pairs (Theil, Sen)."""
+    dx = x[:, None] - x
+    slope = float(np.median(((y[:, None] - y)[dx > 0]) / dx[dx > 0])) if len(x) > 1 else 0.0
+    return slope, float(np.median(y - slope * x))
+
+
+def _sight(cylinder: Cylinder, centre: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Unit vectors (3,) along the axis, from `centre` straight to it, and across both."""
+    axis = cylinder.axis
+    towards = cylinder.start - centre
+    towards = towards - axis * (axis @ towards)
+    towards = np.asarray(towards / np.linalg.norm(towards), np.float64)
+    side: FloatArray = np.cross(axis, towards).astype(np.float64)
+    return axis, towards, side

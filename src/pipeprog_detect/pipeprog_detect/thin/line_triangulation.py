@@ -1,0 +1,434 @@
+"""Thin pipes that the cloud lost: ribbons in the keyframes that agree, over the views, on one cylinder in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_detect.silhouette.apparent_contour import camera_centre, inside, project
+from pipeprog_detect.thin.depth_from_cloud import LAID_REACH, RELIEF_REACH, by_bin, covers, laid, robust_line, spanning
+from pipeprog_detect.thin.line_segments import Ribbons, ribbons, straight_edges
+from pipeprog_detect.types import Cylinder, FloatArray, View
+
+# Lines are sought in views that differ by so much of the distance to what they see, and in no more than so many.
+STEP, MOST_VIEWS = 0.12, 120
+# Half of a thin pipe's width [px] that suffices to see its two outlines: larger images are reduced.
+ENOUGH = 4.5
+# Standard deviations of a ribbon's centre line and width [px], shading and shadows beside the pipe included, ...
+CENTRE_SIGMA, WIDTH_SIGMA = 1.0, 1.2
+# ... and what the worst accepted sum of their squares is: two degrees of freedom, one in a thousand.
+WORST = 13.8
+# The next views that a ribbon is sought in first, and the views in all that must show a pipe.
+PARTNERS, MIN_VIEWS, MIN_SHARE = 3, 4, 0.25
+# Common stretch of two ribbons of one pipe, of the shorter one.
+OVERLAP = 0.3
+# Standard deviation of a hypothesis's depth, in radii of the pipe.
+DEPTH_SIGMA = 1.0
+# Lines that pass so many radii beside each other are the same: a highlight or a shadow lies a radius off an outline.
+SAME_LINE = 0.5
+# Hypotheses that are followed into all views.
+MOST_HYPOTHESES = 4000
+
+
+@dataclass(frozen=True)
+class _Eye:
+    """One view at the size at which lines were sought, its ribbons, and the depths [m] of what it sees.
+
+    `before` (N, 2): depth [m] of the cloud at the ribbons' ends, NaN where the cloud does not show them.
+    """
+
+    view: View
+    ribbons: Ribbons
+    depth: tuple[float, float]
+    before: FloatArray
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """H hypotheses: ends (H, 2, 3) of an axis, its radius (H,) and the standard deviation of its depth (H,) [m]."""
+
+    ends: FloatArray
+    radius: FloatArray
+    sigma: FloatArray
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> _Axes:
+        """Those that a mask or an index array names."""
+        return _Axes(self.ends[keep], self.radius[keep], self.sigma[keep])
+
+
+def propose(
+    views: Sequence[View],
+    points: NDArray[np.float32],
+    radii: Sequence[float],
+    known: Sequence[Cylinder],
+    limit: int,
+    edges: dict[tuple[int, int], FloatArray] | None = None,
+) -> list[Cylinder]:
+    """Up to `limit` cylinders of the given radii [m] that the lines of several views agree on, best seen first.
+
+    `points` (N, 3) of the cloud bound the depths of each view. A ribbon of a view and a radius make a cylinder: its
+    depth follows from the ribbon's width, and from the centre line of another view's ribbon where the camera has moved
+    across the pipe. Ribbons within the silhouette of a `known` cylinder are left out. An outline
+    with a shadow's edge or a highlight beside it makes a rival of the pipe: both are proposed. `edges` remembers the
+    images' edges by stamp and width.
+    """
+    lines = {} if edges is None else edges
+    eyes = [eye for eye in (_eye(view, points, radii, known, lines) for view in _few(views, points)) if eye is not None]
+    parts = [_raised(eye, radius) for eye in eyes for radius in radii]
+    parts += [
+        _pairs(eye, other, radius)
+        for number, eye in enumerate(eyes)
+        for other in eyes[number + 1 : number + 1 + PARTNERS]
+        for radius in radii
+    ]
+    parts = [part for part in parts if len(part.radius)]
+    if not parts:
+        return []
+    columns = zip(*([one.ends, one.radius, one.sigma] for one in parts), strict=True)
+    axes = _Axes(*(np.concatenate(column) for column in columns))
+    axes = axes.select(np.arange(0, len(axes.radius), -(-len(axes.radius) // MOST_HYPOTHESES)))
+    for _ in range(2):
+        matched = [_matches(axes, eye) for eye in eyes]
+        axes = _adjusted(axes, eyes, matched)
+    matched = [_matches(axes, eye) for eye in eyes]
+    sees = np.stack([_sees(axes, eye) for eye in eyes])
+    seen = sees.sum(axis=0)
+    count = np.sum([ribbon >= 0 for ribbon in matched], axis=0)
+    found: list[Cylinder] = []
+    centres: list[FloatArray] = []
+    for best in np.argsort(-count, kind="stable"):
+        if count[best] < max(MIN_VIEWS, MIN_SHARE * seen[best]):
+            break
+        cylinder = Cylinder(axes.ends[best, 0], axes.ends[best, 1], float(axes.radius[best]))
+        covering = [k for k in range(len(found)) if covers(found[k], cylinder, centres[k], SAME_LINE)]
+        if covering:
+            found[covering[0]] = spanning(found[covering[0]], cylinder, centres[covering[0]])
+        elif len(found) < limit:
+            found.append(cylinder)
+            centres.append(np.mean([camera_centre(eyes[k].view) for k in np.flatnonzero(sees[:, best])], axis=0))
+    if not found:
+        return []
+    found = [laid(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)]
+    radius = np.array([one.radius for one in found])
+    axes = _Axes(np.stack([[one.start, one.end] for one in found]), radius, DEPTH_SIGMA * radius)
+    axes = _adjusted(axes, eyes, [_matches(axes, eye) for eye in eyes])
+    return [Cylinder(ends[0], ends[1], float(radius)) for ends, radius in zip(axes.ends, axes.radius, strict=True)]
+
+
+def _few(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
+    """Views of the cloud's points far enough from the last one to tell more than it did."""
+    chosen: list[View] = []
+    sparse = points[:: max(len(points) // 5000, 1)]
+    for view in views:
+        depth = _seen_points(view, sparse)[1]
+        if len(depth) and (
+            not chosen
+            or np.linalg.norm(camera_centre(view) - camera_centre(chosen[-1])) > STEP * float(np.median(depth))
+        ):
+            chosen.append(view)
+    return chosen[:: -(-len(chosen) // MOST_VIEWS)] if chosen else []
+
+
+def _eye(
+    view: View,
+    points: NDArray[np.float32],
+    radii: Sequence[float],
+    known: Sequence[Cylinder],
+    lines: dict[tuple[int, int], FloatArray],
+) -> _Eye | None:
+    pixel, depth = _seen_points(view, points)
+    if len(depth) < 100:
+        return None
+    near, middle, far = np.percentile(depth[:: max(len(depth) // 5000, 1)], [1, 50, 99])
+    scale = min(1.0, ENOUGH * middle / (min(radii) * view.camera.fx))
+    scale = 2.0 ** (round(4.0 * np.log2(scale)) / 4.0)  # few sizes, so that edges found before serve again
+    if scale < 1.0:
+        width, height = (max(round(scale * side), 1) for side in (view.camera.width, view.camera.height))
+        image = np.asarray(cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        view = replace(view, image=image, camera=view.camera.scaled(scale))
+        pixel = (pixel + 0.5) * scale - 0.5
+    focal = view.camera.fx
+    narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
+    key = (view.stamp, view.camera.width)
+    if key not in lines:
+        lines[key] = straight_edges(view.image)
+    found = ribbons(lines[key], max(narrowest, 2.0), widest)
+    within = np.zeros(len(found), bool)
+    for cylinder in known:
+        within |= _covered(found, cylinder, view)
+    found = found.select(~within)
+    before, flat = _relief(found, pixel, depth, min(radii))
+    return _Eye(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
+
+
+def _relief(
+    found: Ribbons, pixel: NDArray[np.float32], depth: NDArray[np.float32], radius: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Depth [m] of the cloud at the ends (N, 2) of ribbons that stand out from it, and which lie flat in it (N,).
+
+    A pipe that touches a wall stands out from it by its diameter, a painted strip, a joint or a shadow does not.
+    Stereo spreads a thin pipe in depth, towards the wall: of the points within a ribbon the nearer count. Where a
+    ribbon holds too few, depth is NaN.
+    """
+    before = np.full((len(found), 2), np.nan)
+    flat = np.zeros(len(found), bool)
+    for number in range(len(found)):
+        ends, width = found.ends[number], float(found.width[number].mean())
+        reach = RELIEF_REACH * width
+        near = ((pixel > ends.min(axis=0) - reach) & (pixel < ends.max(axis=0) + reach)).all(axis=1)
+        along = ends[1] - ends[0]
+        length = float(np.linalg.norm(along))
+        along = along / length
+        offset = pixel[near] - ends[0]
+        place, aside = offset @ along, offset @ np.array([-along[1], along[0]])
+        within = (place > 0) & (place < length)
+        bins = max(int(length / max(width, 6.0)), 3)
+        cell = np.clip((place / length * bins).astype(int), 0, bins - 1)
+        inner = within & (np.abs(aside) < 0.35 * width)
+        front = by_bin(cell[inner], depth[near][inner], bins, 30.0)
+        flanks = []
+        for side in (-1.0, 1.0):
+            beside = within & (side * aside > 1.2 * width) & (side * aside < reach)
+            flanks.append(by_bin(cell[beside], depth[near][beside], bins, 50.0))
+        known = np.isfinite(front)
+        if known.sum() < 0.5 * bins:
+            continue
+        behind = np.fmax(*flanks)
+        step = behind - front
+        judged = np.isfinite(step)
+        flat[number] = judged.sum() >= 0.5 * bins and np.median(step[judged]) < radius
+        if flat[number]:
+            continue
+        # Inverse depth is linear along the image of a line.
+        at = (np.arange(bins) + 0.5) / bins
+        slope, level = robust_line(at[known], 1.0 / front[known])
+        if level > 0 and level + slope > 0:
+            before[number] = 1.0 / level, 1.0 / (level + slope)
+    return before, flat
+
+
+def _raised(eye: _Eye, radius: float) -> _Axes:
+    """Axes of ribbons that stand out from the cloud and are as wide as a pipe of `radius` [m] would be there."""
+    depth = eye.before + 0.5 * radius
+    width = 2.0 * eye.view.camera.fx * radius / depth
+    fits = np.isfinite(depth).all(axis=1) & (np.abs(width - eye.ribbons.width).max(axis=1) < 2.5 * WIDTH_SIGMA)
+    in_eye = _rays(eye)[fits] * depth[fits][..., None]
+    pose = np.linalg.inv(eye.view.camera_from_map)
+    count = len(in_eye)
+    return _Axes(in_eye @ pose[:3, :3].T + pose[:3, 3], np.full(count, radius), np.full(count, DEPTH_SIGMA * radius))
+
+
+def _seen_points(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels (M, 2) and depths (M,) [m] of those points (N, 3) that lie within the view."""
+    pose = view.camera_from_map.astype(np.float32)
+    camera = view.camera
+    depth = points @ pose[2, :3] + pose[2, 3]
+    front = depth > 0.05
+    points, depth = points[front], depth[front]
+    x = camera.fx * (points @ pose[0, :3] + pose[0, 3]) / depth + camera.cx
+    y = camera.fy * (points @ pose[1, :3] + pose[1, 3]) / depth + camera.cy
+    inside = (x > 0) & (y > 0) & (x < camera.width - 1) & (y < camera.height - 1)
+    return np.stack([x[inside], y[inside]], axis=1), depth[inside]
+
+
+def _covered(found: Ribbons, cylinder: Cylinder, view: View) -> NDArray[np.bool_]:
+    """Ribbons (N,) whose both ends lie within the silhouette of a cylinder."""
+    ends, depth = project(view, np.stack([cylinder.start, cylinder.end]))
+    if (depth < 0.05).any():
+        return np.zeros(len(found), bool)
+    along = ends[1] - ends[0]
+    length = float(np.linalg.norm(along)) + 1e-9
+    along = along / length
+    offset = found.ends - ends[0]
+    place = offset @ along
+    aside = np.abs(offset @ np.array([-along[1], along[0]]))
+    reach = view.camera.fx * cylinder.radius / depth.min()
+    return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
+
+
+def _rays(eye: _Eye) -> FloatArray:
+    """Directions (N, 2, 3) with unit depth, in the camera's frame, of the ribbons' ends."""
+    camera = eye.view.camera
+    ends = eye.ribbons.ends
+    x = (ends[..., 0] - camera.cx) / camera.fx
+    y = (ends[..., 1] - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def _centre_lines(found: Ribbons) -> FloatArray:
+    """Lines (N, 3) through the ribbons' ends with unit normals: line . (x, y, 1) is the distance [px]."""
+    along = found.ends[:, 1] - found.ends[:, 0]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
+    return np.concatenate([normal, -np.einsum("ij,ij->i", normal, found.ends[:, 0])[:, None]], axis=1)
+
+
+def _lost(eye: _Eye) -> _Eye:
+    """The view with those ribbons alone that the cloud does not show."""
+    return replace(eye, ribbons=eye.ribbons.select(np.asarray(np.isnan(eye.before).any(axis=1), bool)))
+
+
+def _pairs(eye: _Eye, other: _Eye, radius: float) -> _Axes:
+    """Axes that a ribbon of one view and one of another make with a radius [m].
+
+    The inverse depth of each end of the first follows by linear least squares from both widths and from the distance
+    of the projected end from the other centre line.
+    """
+    none = _Axes(np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+    if not len(eye.ribbons) or not len(other.ribbons):
+        return none
+    eye, other = _lost(eye), _lost(other)  # what the cloud shows needs no second view
+    if not len(eye.ribbons) or not len(other.ribbons):
+        return none
+    focal, rays = eye.view.camera.fx, _rays(eye)
+    other_from_eye = other.view.camera_from_map @ np.linalg.inv(eye.view.camera_from_map)
+    matrix = other.view.camera.matrix
+    still = rays @ (matrix @ other_from_eye[:3, :3]).T
+    shift = matrix @ other_from_eye[:3, 3]
+    width = eye.ribbons.width
+    first = width / (2.0 * focal * radius)
+    depth = still[..., 2] + first * shift[2]
+    if not (depth > 0.1).any():
+        return none
+    depth = np.maximum(depth, 0.1)
+    line = _centre_lines(other.ribbons)
+    slope = (line @ shift)[None, None] / (depth[..., None] * CENTRE_SIGMA)
+    level = -np.einsum("pek,qk->peq", still, line) / (depth[..., None] * CENTRE_SIGMA)
+    gauge = 2.0 * focal * radius / WIDTH_SIGMA
+    own = width / WIDTH_SIGMA
+    gauge_there = (gauge / depth)[..., None]
+    there = other.ribbons.width.mean(axis=1) / WIDTH_SIGMA
+    inverse = (slope * level + (gauge * own)[..., None] + gauge_there * there) / (slope**2 + gauge**2 + gauge_there**2)
+    left = (
+        (slope * inverse - level) ** 2 + (gauge * inverse - own[..., None]) ** 2 + (gauge_there * inverse - there) ** 2
+    )
+    near, far = eye.depth
+    good = ((left < WORST) & (inverse > 1.0 / far) & (inverse < 1.0 / near)).all(axis=1)
+    one, two = np.nonzero(good)
+    if not len(one):
+        return none
+    in_eye = rays[one] / inverse[one, :, two][..., None]
+    pose = np.linalg.inv(eye.view.camera_from_map)
+    axes = _Axes(in_eye @ pose[:3, :3].T + pose[:3, 3], np.full(len(one), radius), np.full(len(one), LAID_REACH))
+    ends, _ = _projected(axes, other)
+    return axes.select(_overlap(ends, other.ribbons.ends[two]) > OVERLAP)
+
+
+def _projected(axes: _Axes, eye: _Eye) -> tuple[FloatArray, FloatArray]:
+    """Pixels (H, 2, 2) and depths (H, 2) of the axes' ends."""
+    pixel, depth = project(eye.view, axes.ends.reshape(-1, 3))
+    return pixel.reshape(-1, 2, 2), depth.reshape(-1, 2)
+
+
+def _overlap(ends: FloatArray, others: FloatArray) -> FloatArray:
+    """Common stretch of segments (..., 2, 2) with others, projected on the first, as a share of the shorter one."""
+    along = ends[..., 1, :] - ends[..., 0, :]
+    length = np.linalg.norm(along, axis=-1) + 1e-9
+    along = along / length[..., None]
+    place = np.einsum("...ek,...k->...e", others - ends[..., :1, :], along)
+    low, high = np.maximum(place.min(axis=-1), 0.0), np.minimum(place.max(axis=-1), length)
+    shorter = np.minimum(length, place.max(axis=-1) - place.min(axis=-1))
+    return np.asarray((high - low) / (shorter + 1e-9))
+
+
+def _sees(axes: _Axes, eye: _Eye) -> NDArray[np.bool_]:
+    """Which axes (H,) have their middle inside the view."""
+    return inside(eye.view, axes.ends.mean(axis=1))
+
+
+def _matches(axes: _Axes, eye: _Eye) -> NDArray[np.int64]:
+    """The ribbon (H,) of the view that fits each axis best, -1 where none does."""
+    none = np.full(len(axes.radius), -1)
+    if not len(eye.ribbons):
+        return none
+    ends, depth = _projected(axes, eye)
+    front = (depth > 0.05).all(axis=1)
+    along = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(along, axis=1) + 1e-9
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
+    offset = eye.ribbons.ends[None] - ends[:, None, :1]
+    aside = np.einsum("hqek,hk->hqe", offset, normal)
+    place = np.einsum("hqek,hk->hqe", offset, along) / (length**2)[:, None, None]
+    inverse = 1.0 / depth[:, 0, None, None] + np.clip(place, 0.0, 1.0) * np.diff(1.0 / depth, axis=1)[:, None]
+    width = 2.0 * eye.view.camera.fx * axes.radius[:, None, None] * inverse
+    left = (aside / (2.0 * CENTRE_SIGMA)) ** 2 + ((width - eye.ribbons.width[None]) / WIDTH_SIGMA) ** 2
+    worst: FloatArray = left.max(axis=2)
+    common = _overlap(np.broadcast_to(ends[:, None], offset.shape), np.broadcast_to(eye.ribbons.ends, offset.shape))
+    worst = np.where(np.asarray(front)[:, None] & (common > OVERLAP), worst, np.inf)
+    best = np.argmin(worst, axis=1)
+    return np.where(worst[np.arange(len(best)), best] < WORST, best, none)
+
+
+def _adjusted(axes: _Axes, eyes: Sequence[_Eye], matched: Sequence[NDArray[np.int64]]) -> _Axes:
+    """The axes after a least-squares step on the ribbons that match, and as long as what these show.
+
+    Each end moves across the axis by (2,); the ribbons' centre lines and widths, at both of the ribbon's ends, are
+    the observations; the depth that a hypothesis came with is the prior.
+    """
+    count = len(axes.radius)
+    along = axes.ends[:, 1] - axes.ends[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    along = along / length[:, None]
+    middle = axes.ends.mean(axis=1)
+    weight = np.stack([_sees(axes, eye) for eye in eyes]).astype(float) + 1e-6
+    towards = middle - weight.T @ np.stack([camera_centre(eye.view) for eye in eyes]) / weight.sum(axis=0)[:, None]
+    depth = towards - along * np.einsum("ij,ij->i", along, towards)[:, None]
+    depth = depth / (np.linalg.norm(depth, axis=1)[:, None] + 1e-12)
+    basis = np.stack([np.cross(along, depth), depth], axis=1)
+    normal = np.eye(4) / axes.sigma[:, None, None] ** 2
+    right = np.zeros((count, 4))
+    low: FloatArray = np.full(count, np.inf)
+    high: FloatArray = np.full(count, -np.inf)
+    for eye, ribbon in zip(eyes, matched, strict=True):
+        rows = np.flatnonzero(ribbon >= 0)
+        if not len(rows):
+            continue
+        chosen, camera = ribbon[rows], eye.view.camera
+        line = _centre_lines(eye.ribbons)[chosen]
+        rotation = eye.view.camera_from_map[:3, :3]
+        pixel, far = _projected(axes.select(rows), eye)
+        image_along = pixel[:, 1] - pixel[:, 0]
+        square = (image_along**2).sum(axis=1)
+        for end in (0, 1):
+            # Where the ribbon's end falls on the axis: perspective makes the share of the length of that in the image.
+            share = np.einsum("ij,ij->i", eye.ribbons.ends[chosen, end] - pixel[:, 0], image_along) / square
+            share = share * far[:, 0] / (far[:, 1] + share * (far[:, 0] - far[:, 1]))
+            share = np.clip(share, -0.5, 1.5)
+            low[rows] = np.minimum(low[rows], share)
+            high[rows] = np.maximum(high[rows], share)
+            point = axes.ends[rows, 0] + (share * length[rows])[:, None] * along[rows]
+            seen, distance = project(eye.view, point)
+            sideways = line[:, :2] @ np.diag([camera.fx, camera.fy])
+            ray = np.stack([(seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy], axis=1)
+            gradient = np.concatenate([sideways, -(sideways * ray).sum(axis=1)[:, None]], axis=1) / distance[:, None]
+            moves = np.einsum("ik,kl,ijl->ij", gradient, rotation, basis[rows])
+            residual = -(np.einsum("ij,ij->i", line[:, :2], seen) + line[:, 2])
+            _accumulate(normal, right, rows, share, moves, residual, CENTRE_SIGMA)
+            width = 2.0 * camera.fx * axes.radius[rows] / distance
+            moves = -(width / distance)[:, None] * np.einsum("l,ijl->ij", rotation[2], basis[rows])
+            _accumulate(normal, right, rows, share, moves, eye.ribbons.width[chosen, end] - width, WIDTH_SIGMA)
+    step = np.linalg.solve(normal, right[..., None])[..., 0].reshape(count, 2, 2)
+    shown = low < high
+    low, high = np.where(shown, low, 0.0).astype(float), np.where(shown, high, 1.0).astype(float)
+    ends = axes.ends + np.einsum("hej,hjk->hek", step, basis)
+    along = ends[:, 1] - ends[:, 0]
+    ends = np.stack([ends[:, 0] + low[:, None] * along, ends[:, 0] + high[:, None] * along], axis=1)
+    return replace(axes, ends=ends)
+
+
+def _accumulate(
+    normal: FloatArray,
+    right: FloatArray,
+    rows: NDArray[np.int64],
+    share: FloatArray,
+    moves: FloatArray,
+    residual: FloatArray,
+    sigma: float,
+) -> None:
+    """Adds observations of the points at `share` of the axes `rows` to the normal equations."""
+    gradient = np.concatenate([(1.0 - share)[:, None] * moves, share[:, None] * moves], axis=1) / sigma
+    normal[rows] += gradient[:, :, None] * gradient[:, None]
+    right[rows] += gradient * (residual / sigma)[:, None]

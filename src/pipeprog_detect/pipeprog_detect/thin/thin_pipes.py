@@ -1,0 +1,157 @@
+"""Thin pipes of which the keyframes show lines and the cloud too little: proposed, laid at their depth, measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_detect.cloud.axial_extent import Run
+from pipeprog_detect.cloud.candidate import Candidate, Evidence
+from pipeprog_detect.config import ContourConfig
+from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.classification import is_planned
+from pipeprog_detect.silhouette.apparent_contour import viewing_direction
+from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, refine
+from pipeprog_detect.silhouette.edge_support import outline_support
+from pipeprog_detect.thin.depth_from_cloud import covers, laid, mean_centre
+from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
+from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.verification.measured_pipe import Measured, is_known, is_stub
+
+# Lines are followed up for so many pipes at most, beside so many of the cloud's points.
+MOST_LOST, MOST_POINTS = 40, 600_000
+# Without points of the cloud the outlines must be the better seen, and each of the two for itself at least half as
+# well: the edge of a duct, whose faces differ in brightness, is one outline, with texture for the other.
+LINES_CONVINCING = 0.6
+# What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
+LINE_DEPTH_SIGMA = 0.03
+# Pipes that run within so much of one direction are laid parallel, to so much; two may be so by chance.
+NEARLY_PARALLEL, PARALLEL_SIGMA, LEAST_PARALLEL = np.radians(5.0), np.radians(0.3), 3
+# The axes of pipes side by side are so many radii apart.
+TOUCHING = 2.0
+# A strip's edges stay where they are, a cylinder's outlines do not: halfway between, by so many standard deviations.
+FLAT, SURELY = 0.5, 2.0
+
+
+def find_lost(
+    points: NDArray[np.floating],
+    thickest: float,
+    found: Sequence[Measured],
+    views: Sequence[View],
+    bill: Bill,
+    config: ContourConfig,
+    edges: dict[tuple[int, int], FloatArray],
+) -> list[Measured]:
+    """Pipes up to `thickest` [m], beside those found, of which the views show lines and the cloud (N, 3) too little.
+
+    They must have a planned size and most of their outlines, and these must move against each other from view to
+    view as a cylinder's do, where the views differ enough to tell. `edges`: as `ribbons.propose` keeps them.
+    """
+    thin = [planned.outer_radius for planned in bill.classes if planned.outer_radius < thickest]
+    if not views or not thin:
+        return []
+    lines = _Lines(views, points.astype(np.float32), thin, bill, config)
+    some = lines.points[:: -(-len(points) // MOST_POINTS)]
+    known = [measured.cylinder for measured in found]
+    lost: list[Measured] = []
+    for proposed in propose(views, some, thin, known, MOST_LOST, edges):
+        if is_known(proposed, known) or _is_rival(proposed, lost, views):
+            continue
+        fit = lines.measure(proposed, known, follow=False)
+        if fit is not None:
+            fit = lines.follow(fit, proposed.radius, known)
+        if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known):
+            continue
+        lost.append(Measured(_seen(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
+        known.append(fit.cylinder)
+    return lost
+
+
+def _is_rival(proposed: Cylinder, lost: Sequence[Measured], views: Sequence[View]) -> bool:
+    """Whether the views show it where they show one of the lost pipes: two cannot both be there."""
+    centre = mean_centre(proposed, views)
+    return centre is not None and any(covers(each.cylinder, proposed, centre, TOUCHING) for each in lost)
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """The views, the cloud's points (N, 3), the radii [m] of thin pipes, and what makes one."""
+
+    views: Sequence[View]
+    points: NDArray[np.float32]
+    radii: Sequence[float]
+    bill: Bill
+    config: ContourConfig
+
+    def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
+        """The whole of a pipe of the given radius of which a piece was found.
+
+        Its depth, which lines seen from one height leave open, is that of the cloud's points before the wall.
+        """
+        slope_known_to = float(np.sqrt(piece.covariance[3, 3]))
+        start, slope_sigma = aligned(replace(piece.cylinder, radius=radius), known, self.views, slope_known_to)
+        centre = mean_centre(start, self.views)
+        at_depth = None if centre is None else laid(start, self.points, centre, not np.isfinite(slope_sigma))
+        depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * radius
+        return self.measure(at_depth or start, known, depth_sigma, slope_sigma)
+
+    def measure(
+        self,
+        proposed: Cylinder,
+        known: Sequence[Cylinder],
+        depth_sigma: float = LINE_DEPTH_SIGMA,
+        slope_sigma: float = np.inf,
+        follow: bool = True,
+    ) -> ContourFit | None:
+        """The fit where it has the outlines of a pipe and a planned size."""
+        start = Start(proposed, proposed.radius, True, depth_sigma, slope_sigma)
+        fit = refine(start, self.views, known, self.config, self.radii, follow)
+        if fit is None or fit.support < LINES_CONVINCING:
+            return None
+        if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.bill):
+            return None
+        if outline_support(fit.cylinder, self.views, known).weaker_share < 0.5 * LINES_CONVINCING:
+            return None
+        return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
+
+
+def aligned(
+    proposed: Cylinder, known: Sequence[Cylinder], views: Sequence[View], slope_known_to: float
+) -> tuple[Cylinder, float]:
+    """The cylinder as parallel to the known ones of nearly its direction as its image allows, and how sure [rad].
+
+    Seen from one height alone, a level pipe may as well slope towards the cameras: what else runs there tells, as far
+    as it differs by no more than the cylinder's own slope may be wrong, `slope_known_to` [rad].
+    """
+    middle = 0.5 * (proposed.start + proposed.end)
+    across = np.cross(proposed.axis, viewing_direction(proposed, views))
+    across = across / np.linalg.norm(across)
+    towards = np.cross(across, proposed.axis)
+    axes = np.array([other.axis * np.sign(other.axis @ proposed.axis) for other in known]).reshape(-1, 3)
+    steepest = max(np.tan(NEARLY_PARALLEL), 3.0 * slope_known_to)
+    slope = np.abs(axes @ towards) / (axes @ proposed.axis)
+    axes = axes[(np.abs(axes @ across) < np.sin(NEARLY_PARALLEL)) & (slope < steepest)]
+    if len(axes) < LEAST_PARALLEL:
+        return proposed, np.inf
+    direction = np.median(axes, axis=0)
+    spread = float(np.median(np.linalg.norm(axes - direction, axis=1)))
+    direction = direction - (direction @ across) * across
+    half = 0.5 * proposed.length * direction / np.linalg.norm(direction)
+    return Cylinder(middle - half, middle + half, proposed.radius), max(spread, PARALLEL_SIGMA)
+
+
+def _seen(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:
+    """The candidate that stands for a pipe found by its lines, with what the cloud (N, 3) holds of it."""
+    cylinder = fit.cylinder
+    offset = points - cylinder.start
+    along = offset @ cylinder.axis
+    near = (along > 0) & (along < cylinder.length)
+    offset, along = offset[near], along[near]
+    distance = np.linalg.norm(offset - along[:, None] * cylinder.axis, axis=1) - cylinder.radius
+    distance = distance[np.abs(distance) < cylinder.radius]
+    noise = float(np.sqrt(np.mean(distance**2))) if len(distance) else cylinder.radius
+    evidence = Evidence(np.pi, fit.support, 0.0, noise, 0.0, 1.0)
+    return Candidate(cylinder, fit.radius_sigma, len(distance), [Run(0.0, cylinder.length)], evidence)

@@ -1,0 +1,110 @@
+"""What is around a cylinder says about its side: a pipe is seen from outside, rounds no corner, lies in no wall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeprog_detect.cloud.candidate import Candidate
+from pipeprog_detect.cloud.octree import IntArray, Octree
+from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.silhouette.apparent_contour import frame
+from pipeprog_detect.types import Cylinder, FloatArray
+
+# Mean cosine between the normals of a pipe and those of its points: noise turns a thin pipe's by less than 60 deg.
+_OUTWARD = 0.5
+# A plane is tangent to a cylinder along it within these angles, and at its radius but for this share and the noise.
+_ALONG = float(np.sin(np.radians(6.0)))
+_TANGENT = 0.15
+# Planes that meet at less than 30 deg make no corner.
+_CORNER = float(np.cos(np.radians(30.0)))
+# Walls are looked at in steps [m] of a cylinder's length, as far beside it as so many radii or metres, ...
+_STEP, _BESIDE, _LEAST_BESIDE = 0.05, 3.0, 0.03
+# ... aslant up to so many times as far before and behind it; so many points tell where one is.
+_ASLANT, _LEAST_POINTS = 3.0, 3
+# A cylinder whose axis lies behind the wall, or before it by less than this share of the radius, is in it.
+_IN_WALL = 0.5
+# Walls are flat to so much [m] over that.
+_WAVINESS = 1e-3
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The points beside large planes, their normals (N, 3) towards the sensor (None: not known), and the planes.
+
+    `walls`: points on the planes; `sigma` [m]: the cloud's noise.
+    """
+
+    tree: Octree
+    outward: FloatArray | None
+    planes: Sequence[Plane]
+    walls: Octree
+    sigma: float
+
+    def outwardness(self, candidate: Candidate) -> float | None:
+        """Mean cosine between the normals of the points on a cylinder and its own, None where they are not known.
+
+        Near 1 on a pipe seen from outside, near -1 in a corner and on a pipe seen from inside.
+        """
+        if self.outward is None:
+            return None
+        rows, radial = self._surface(candidate)
+        return float(np.einsum("ij,ij->i", radial, self.outward[rows]).mean()) if len(rows) else 0.0
+
+    def contradict(self, candidate: Candidate) -> bool:
+        """Whether they make it no pipe: it is hollow, or rounds the edge or the corner of two planes.
+
+        Such a rounding is tangent to both planes, and lies where they would meet; a pipe in a corner shows its other
+        side.
+        """
+        outwardness = self.outwardness(candidate)
+        if outwardness is not None and outwardness < _OUTWARD:
+            return True
+        cylinder = candidate.cylinder
+        middle = 0.5 * (cylinder.start + cylinder.end)
+        allowed = _TANGENT * cylinder.radius + 3.0 * candidate.band
+        feet = []
+        for plane in self.planes:
+            away = plane.offset - float(plane.normal @ middle)
+            if abs(plane.normal @ cylinder.axis) < _ALONG and abs(abs(away) - cylinder.radius) < allowed:
+                feet.append(np.sign(away) * plane.normal)
+        corners = [one + other for k, one in enumerate(feet) for other in feet[:k] if abs(float(one @ other)) < _CORNER]
+        if not corners:
+            return False
+        front = self._surface(candidate)[1].mean(axis=0)
+        return any(float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner) for corner in corners)
+
+    def bury(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
+        """Whether more than half of the cylinder, looked at along `towards` (3,), would lie within walls.
+
+        The outlines are seen where the view touches the cylinder, beside its axis and hardly nearer than that: a wall
+        that shows its own face nearer than the axis on both sides would hide both of them. What the view says of the
+        depth may be off by some of the radius, and a pipe on a wall has its axis a whole radius before it.
+        """
+        sideways, depth = frame(cylinder, towards)
+        reach = cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE)
+        rows = self.walls.near_segment(cylinder.start, cylinder.end, _ASLANT * reach)
+        offset = self.walls.points[rows] - cylinder.start
+        aside, behind = offset @ sideways, offset @ depth
+        bins = max(int(cylinder.length / _STEP), 4)
+        place = np.clip((offset @ cylinder.axis / cylinder.length * bins).astype(np.int64), 0, bins - 1)
+        clear = 3.0 * float(np.hypot(self.sigma, radius_sigma)) + _WAVINESS
+        surface = _IN_WALL * cylinder.radius - clear
+        buried = 0
+        for step in range(bins):
+            beside = (place == step) & (np.abs(aside) > cylinder.radius) & (np.abs(aside) < reach)
+            flanks = [behind[beside & (side * aside > 0)] for side in (-1.0, 1.0)]
+            buried += all(len(flank) >= _LEAST_POINTS and np.median(flank) < surface for flank in flanks)
+        return buried > 0.5 * bins
+
+    def _surface(self, candidate: Candidate) -> tuple[IntArray, FloatArray]:
+        """Rows of the points on the cylinder's surface and the unit vectors (K, 3) from its axis to them."""
+        cylinder = candidate.cylinder
+        rows = self.tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)
+        offset = self.tree.points[rows] - cylinder.start
+        radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+        distance = np.linalg.norm(radial, axis=1)
+        near = np.abs(distance - cylinder.radius) < 3.0 * candidate.band
+        return rows[near], radial[near] / (distance[near] + 1e-12)[:, None]

@@ -1,0 +1,113 @@
+"""Pipes that run into walls, floors and ceilings: ends that no keyframe shows, and ends that lie behind a wall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeprog_detect.cloud.octree import Octree
+from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.silhouette.apparent_contour import camera_centre, showing
+from pipeprog_detect.silhouette.extension import outline_evidence
+from pipeprog_detect.silhouette.limb_edges import SHARP
+from pipeprog_detect.types import Cylinder, FloatArray, View
+
+# An axis meets a plane at more than 30 deg, or it rather runs along it.
+MEETS = 0.5
+# A plane is there where some of its points, so near to it, lie within so much of the place [m]: what hides a pipe's end
+# hides the floor beside it, too.
+ON_PLANE, NEAR, LEAST_POINTS = 0.01, 0.5, 10
+# Planes that an axis meets within so much [m] are one.
+SAME_PLANE = 0.05
+# A plane goes on all around a pipe that passes it where its points lie in so many of the sectors about the pipe.
+SECTORS, CLOSED = 8, 6
+# Views that suffice to tell whether the pipe goes on.
+ENOUGH_VIEWS = 12
+
+
+def abutted(
+    cylinder: Cylinder,
+    rims: tuple[float, float],
+    planes: Sequence[Plane],
+    walls: Octree,
+    views: Sequence[View],
+    others: Sequence[Cylinder],
+) -> Cylinder:
+    """The cylinder with its ends on the planes, of which `walls` are points, where it runs into them.
+
+    `rims`: what the images say for a rim at the start and at the end (`rim.End.odds`).
+
+    Ends come along a pipe at a rate of one in its own length, for what is known. Where the keyframes do not show that
+    it stops before a plane, that it goes on to it is the more probable the nearer the plane is. What lies behind a
+    plane as seen from every camera, and is closed in by it, was not seen.
+    """
+    ends = []
+    for at_end in (False, True):
+        end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
+        ahead: list[float] = []
+        for plane in sorted(planes, key=lambda plane: -plane.area):
+            distance = _distance(end, out, cylinder, plane, walls, views)
+            # Small planes are pieces of large ones, and know less well where these are.
+            if distance is not None and all(abs(distance - other) > SAME_PLANE for other in ahead):
+                ahead.append(distance)
+        nearest = min(ahead, default=0.0)
+        if nearest > 0.0 and not _goes_on(cylinder, at_end, rims[at_end], nearest, views, others):
+            nearest = 0.0
+        ends.append(end + nearest * out)
+    return Cylinder(ends[0], ends[1], cylinder.radius)
+
+
+def _distance(
+    end: FloatArray, out: FloatArray, cylinder: Cylinder, plane: Plane, walls: Octree, views: Sequence[View]
+) -> float | None:
+    """How far [m] beyond the end, or before it, the axis meets the plane; None where that says nothing of the end."""
+    slope = float(plane.normal @ out)
+    if abs(slope) < MEETS:
+        return None
+    distance = float(plane.offset - plane.normal @ end) / slope
+    # Half of the ends lie within ln 2 of the mean distance between them.
+    if not -0.5 * cylinder.length < distance < np.log(2.0) * cylinder.length:
+        return None
+    place, thick = end + distance * out, ON_PLANE * plane.normal
+    offset = walls.points[walls.near_segment(place - thick, place + thick, NEAR)] - place
+    if len(offset) < LEAST_POINTS:
+        return None
+    if distance < 0.0:
+        before = float(plane.normal @ out)
+        seen_from = [before * float(plane.offset - plane.normal @ camera_centre(view)) for view in views]
+        if min(seen_from, default=0.0) <= 0.0 or not _closed(offset, out, cylinder.radius):
+            return None
+    return distance
+
+
+def _closed(offset: FloatArray, axis: FloatArray, radius: float) -> bool:
+    """Whether the points (N, 3), given from where the axis passes, lie close to the pipe on most of its sides."""
+    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    u = u / np.linalg.norm(u)
+    x, y = offset @ u, offset @ np.cross(axis, u)
+    close = np.hypot(x, y) < 4.0 * radius + 0.05
+    sector = ((np.arctan2(y[close], x[close]) / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
+    return len(np.unique(sector)) >= CLOSED
+
+
+def _goes_on(
+    cylinder: Cylinder, at_end: bool, rim: float, ahead: float, views: Sequence[View], others: Sequence[Cylinder]
+) -> bool:
+    """Whether it is more probable that the pipe goes on for `ahead` [m] than that it ends within that."""
+    end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
+    looking = showing(end + np.linspace(0.0, 1.0, 5)[:, None] * ahead * out, views, ENOUGH_VIEWS)
+    total: FloatArray = np.zeros(1)
+    place: FloatArray = np.zeros(1)
+    if looking:
+        still = np.zeros(len(looking))
+        evidence = outline_evidence(cylinder, at_end, ahead, looking, others, still, SHARP)
+        if evidence is None:
+            return False
+        beyond = (evidence.along > 0.0) & (evidence.along < ahead)
+        total = np.append(0.0, np.cumsum(evidence.log_odds[beyond]))
+        place = np.append(0.0, evidence.along[beyond])
+    rate = 1.0 / cylinder.length
+    ends_here = total - rate * place + np.log(-np.expm1(-rate * ahead / len(place)))
+    ends_here[0] += rim
+    return bool(total[-1] - rate * ahead > np.logaddexp.reduce(ends_here))

@@ -1,0 +1,79 @@
+"""Runs of pipes: what fittings connect, and the length of the centre line through them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeprog_detect.product.pipe_runs import find_joints, pipe_runs
+from pipeprog_detect.types import Cylinder
+
+
+def cylinder(start: tuple[float, float, float], end: tuple[float, float, float], radius: float = 0.05) -> Cylinder:
+    return Cylinder(np.array(start), np.array(end), radius)
+
+
+BEND = 0.15
+ALONG = cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+UP = cylinder((1.0 + BEND, BEND, 0.0), (1.0 + BEND, 0.9, 0.0))
+
+
+def test_an_elbow_joins_two_pipes_and_its_arc_counts() -> None:
+    (run,) = pipe_runs([ALONG, UP])
+    assert [joint.kind for joint in run.joints] == ["elbow"]
+    assert run.barrel == pytest.approx(1.0 + 0.9 - BEND)
+    assert run.centre_line == pytest.approx(run.barrel + 0.5 * np.pi * BEND)
+
+
+@given(turn=st.floats(0.2, 2.2), bend=st.floats(2.0, 9.0), spin=st.floats(0.0, 6.2))
+def test_elbows_of_any_turn(turn: float, bend: float, spin: float) -> None:
+    radius = 0.03
+    tangent = bend * radius * np.tan(0.5 * turn)
+    aside = np.array([0.0, np.cos(spin), np.sin(spin)])
+    out = np.cos(turn) * np.array([1.0, 0.0, 0.0]) + np.sin(turn) * aside
+    corner = np.array([1.0 + tangent, 0.0, 0.0])
+    pipes = [
+        Cylinder(np.zeros(3), np.array([1.0, 0.0, 0.0]), radius),
+        Cylinder(corner + tangent * out, corner + (tangent + 0.5) * out, radius),
+    ]
+    (run,) = pipe_runs(pipes)
+    assert run.centre_line == pytest.approx(1.5 + bend * radius * turn, rel=1e-6)
+    turned = [Cylinder(pipe.end, pipe.start, pipe.radius) for pipe in reversed(pipes)]
+    assert pipe_runs(turned)[0].centre_line == pytest.approx(run.centre_line)
+
+
+def test_a_tee_and_a_reducer() -> None:
+    branch = cylinder((0.5, 0.06, 0.0), (0.5, 0.6, 0.0), 0.03)
+    thinner = cylinder((1.12, 0.0, 0.0), (1.9, 0.0, 0.0), 0.03)
+    (run,) = pipe_runs([ALONG, branch, thinner])
+    assert [(joint.kind, joint.pipes) for joint in run.joints] == [("reducer", (0, 2)), ("tee", (1, 0))]
+    assert run.barrel == pytest.approx(1.0 + 0.54 + 0.78)
+    assert run.centre_line == pytest.approx(run.barrel + 0.12 + 0.06)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        cylinder((0.0, 0.3, 0.0), (1.0, 0.3, 0.0)),  # beside it
+        cylinder((1.15, 0.15, 0.06), (1.15, 0.9, 0.06)),  # passes it
+        cylinder((0.5, 0.3, 0.0), (0.5, 0.9, 0.0)),  # ends well before it
+        cylinder((0.5, -0.5, 0.11), (0.5, 0.5, 0.11)),  # crosses it
+        cylinder((1.15, 0.15, 0.0), (1.15, 0.9, 0.0), 0.02),  # an elbow does not change the size
+        cylinder((1.9, 0.9, 0.0), (1.9, 1.9, 0.0)),  # too far for a bend
+        cylinder((2.5, 0.0, 0.0), (3.5, 0.0, 0.0)),  # on its line, but what is between is not known
+    ],
+)
+def test_pipes_that_are_not_connected(other: Cylinder) -> None:
+    assert find_joints([ALONG, other]) == []
+    assert [run.pipes for run in pipe_runs([ALONG, other])] == [(0,), (1,)]
+
+
+def test_an_end_has_one_fitting() -> None:
+    other = cylinder((1.0 + BEND, -BEND, 0.0), (1.0 + BEND, -0.9, 0.001))
+    assert len([joint for joint in find_joints([ALONG, UP, other]) if 0 in joint.pipes]) == 1
+
+
+def test_no_pipes_no_runs() -> None:
+    assert pipe_runs([]) == []

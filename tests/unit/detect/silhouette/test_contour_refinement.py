@@ -1,0 +1,118 @@
+"""Refinement by outlines on ray-cast images: shadows, starts, occluders and empty walls."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pipeprog_detect.config import ContourConfig
+from pipeprog_detect.silhouette.apparent_contour import frame
+from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.silhouette.edge_support import support
+from pipeprog_detect.types import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE
+
+UP = np.array([0.0, 0.0, 1.0])
+# One pixel is 3.5 mm here; the limb operator resolves a tenth of the blur.
+RADIUS_TOLERANCE = 0.35e-3
+CONFIG = ContourConfig()
+
+
+def disturbed(random: np.random.Generator) -> Cylinder:
+    """Both ends a fifth of the radius aside, the radius a tenth off."""
+    basis = frame(PIPE, np.array([0.0, 1.0, 0.0]))
+    angle = random.uniform(0.0, 2.0 * np.pi, 2)
+    aside = 0.2 * PIPE.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1) @ basis
+    return Cylinder(PIPE.start + aside[0], PIPE.end + aside[1], PIPE.radius * (1.0 + 0.1 * random.choice([-1, 1])))
+
+
+def test_converges_from_every_start_beside_a_shadow(pipe_views: list[View]) -> None:
+    random = np.random.default_rng(5)
+    for _ in range(4):
+        fit = refine(Start(disturbed(random), 0.1 * PIPE.radius), pipe_views, [], CONFIG)
+        assert fit is not None
+        assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=RADIUS_TOLERANCE)
+        assert abs(fit.cylinder.radius - PIPE.radius) < 3.0 * fit.radius_sigma < 2e-3
+        assert fit.support > 0.8
+        assert fit.views == len(pipe_views)
+        for point in (fit.cylinder.start, fit.cylinder.end):
+            across = np.cross(point - PIPE.start, PIPE.axis)
+            assert np.linalg.norm(across) < 3e-3
+
+
+def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[View]) -> None:
+    random = np.random.default_rng(2)
+    noisy = []
+    for view in pipe_views:
+        pose = view.camera_from_map.copy()
+        pose[:3, 3] += random.normal(0.0, 1.5e-3, 3)
+        noisy.append(dataclasses.replace(view, camera_from_map=pose))
+    clean = refine(Start(PIPE, 0.002), pipe_views, [], CONFIG)
+    fit = refine(Start(PIPE, 0.002), noisy, [], CONFIG)
+    assert clean is not None
+    assert fit is not None
+    assert abs(fit.cylinder.radius - PIPE.radius) < 3.0 * fit.radius_sigma
+    assert abs(fit.cylinder.radius - PIPE.radius) < 2.0 * RADIUS_TOLERANCE
+    assert np.trace(fit.covariance[:2, :2]) > 1.5 * np.trace(clean.covariance[:2, :2])
+
+
+def test_the_ends_are_found_from_a_short_start(pipe_views: list[View]) -> None:
+    short = Cylinder(PIPE.start + 0.04 * PIPE.axis, PIPE.end - 0.04 * PIPE.axis, PIPE.radius)
+    fit = refine(Start(short, 0.002), pipe_views, [], CONFIG)
+    assert fit is not None
+    # One pixel along the pipe, and what the rim is worth against it.
+    assert fit.cylinder.length == pytest.approx(PIPE.length, abs=3.5e-3)
+
+
+def test_a_catalogue_radius_does_not_pull(pipe_views: list[View]) -> None:
+    free = refine(Start(PIPE, 0.003), pipe_views, [], CONFIG)
+    seeded = refine(Start(PIPE, 0.003), pipe_views, [], CONFIG, planned_radii=(0.042, 0.0365))
+    assert free is not None
+    assert seeded is not None
+    assert seeded.cylinder.radius == pytest.approx(free.cylinder.radius, abs=2e-5)
+
+
+def test_same_input_same_result(pipe_views: list[View]) -> None:
+    first, second = (refine(Start(PIPE, 0.003), pipe_views, [], CONFIG) for _ in range(2))
+    assert first is not None
+    assert second is not None
+    assert first.cylinder.radius == second.cylinder.radius
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
+    assert refine(Start(PIPE, 0.004), empty_views, [], CONFIG) is None
+    assert refine(Start(PIPE, 0.004), [], [], CONFIG) is None
+    assert refine(Start(PIPE, 0.004), empty_views, [], ContourConfig(enabled=False)) is None
+    above = Cylinder(PIPE.start + 3.0 * UP, PIPE.end + 3.0 * UP, PIPE.radius)
+    assert refine(Start(above, 0.004), empty_views, [], CONFIG) is None
+
+
+def test_support_tells_a_pipe_from_a_guess(pipe_views: list[View], empty_views: list[View]) -> None:
+    thick = Cylinder(PIPE.start, PIPE.end, 1.2 * PIPE.radius)
+    assert support(PIPE, pipe_views, []) > 0.9
+    assert support(thick, pipe_views, []) < 0.2
+    assert support(PIPE, empty_views, []) < 0.2
+
+
+def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:
+    screen = Cylinder(np.array([-0.5, -0.3, 0.0]), np.array([0.5, -0.3, 0.0]), 0.05)
+    fit = refine(Start(PIPE, 0.002), pipe_views, [screen], CONFIG)
+    assert fit is not None
+    assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=2.0 * RADIUS_TOLERANCE)
+
+
+@pytest.mark.parametrize("radius_known", [True, False])
+@pytest.mark.parametrize("aside", [0.0, 0.02, 0.05, 0.08])
+def test_what_is_thinner_than_its_edges_can_tell_is_measured_as_something_or_not_at_all(
+    empty_views: list[View], pipe_views: list[View], radius_known: bool, aside: float
+) -> None:
+    """Edges of texture may pull a thin cylinder's radius below zero."""
+    place = np.array([aside, 0.0, 0.1])
+    for views in (empty_views, pipe_views):
+        for radius in (0.3e-3, 0.6e-3, 1e-3):
+            thread = Cylinder(PIPE.start + place, PIPE.end + place - [0.0, 0.0, 0.2], radius)
+            fit = refine(Start(thread, radius, radius_known, 0.03), views, [], ContourConfig(), [radius])
+            assert fit is None or fit.cylinder.radius > 0

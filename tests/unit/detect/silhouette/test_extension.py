@@ -1,0 +1,76 @@
+"""A pipe of which a piece is known is followed in the images to its ends, and no farther."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeprog_detect.config import ContourConfig
+from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.silhouette.extension import grown, outline_evidence
+from pipeprog_detect.types import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE
+
+END_TOLERANCE = 2e-3  # half a pixel
+STATIONS_TOLERANCE = 0.03  # outlines alone tell an end to two stations of 6 px
+
+
+@pytest.mark.parametrize("piece", [(0.0, 0.16), (0.12, 0.28), (0.24, 0.4)])
+def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[float, float]) -> None:
+    low, high = (PIPE.start + place * PIPE.axis for place in piece)
+    fit = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], ContourConfig())
+    assert fit is not None
+    assert (fit.cylinder.start - PIPE.start) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
+    assert (fit.cylinder.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
+    assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=0.5e-3)
+    short = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], ContourConfig(), follow=False)
+    assert short is not None
+    assert short.cylinder.length < 0.2
+
+
+@pytest.mark.parametrize("length", [0.05, 0.06])
+@pytest.mark.parametrize("place", [0.0, 0.1, 0.2, 0.3])
+def test_a_piece_too_short_to_tell_its_direction_grows_in_the_one_that_its_edges_ahead_tell(
+    pipe_views: list[View], length: float, place: float
+) -> None:
+    random = np.random.default_rng(0)
+    views = [
+        replace(view, image=np.clip(view.image + 16.0 * random.standard_normal(view.image.shape), 0, 255).astype("u1"))
+        for view in pipe_views
+    ]
+    low = PIPE.start + place * PIPE.axis
+    fit = refine(Start(Cylinder(low, low + length * PIPE.axis, PIPE.radius), 0.002), views, [], ContourConfig())
+    assert fit is not None
+    assert fit.cylinder.length == pytest.approx(PIPE.length, abs=2.0 * END_TOLERANCE)
+
+
+def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[View], empty_views: list[View]) -> None:
+    for views in (pipe_views, empty_views):
+        same = grown(PIPE, views, [], np.zeros(len(views)), 0.5)
+        assert same.length == pytest.approx(PIPE.length, abs=1e-9)
+
+
+def test_what_hides_a_pipe_does_not_end_it(pipe_views: list[View]) -> None:
+    """A rod, known to cross before the pipe, leaves a gap in what is seen of it."""
+    known = Cylinder(PIPE.start, PIPE.start + 0.16 * PIPE.axis, PIPE.radius)
+    crossing = PIPE.start + 0.24 * PIPE.axis + np.array([0.0, -0.15, 0.0])
+    rod = Cylinder(crossing - np.array([0.4, 0.0, 0.0]), crossing + np.array([0.4, 0.0, 0.0]), 0.03)
+    still = np.zeros(len(pipe_views))
+    once = grown(known, pipe_views, [rod], still, 0.5)
+    twice = grown(once, pipe_views, [rod], still, 0.5)
+    assert (twice.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=STATIONS_TOLERANCE)
+
+
+def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
+    short = Cylinder(PIPE.start, PIPE.end - 0.1 * PIPE.axis, PIPE.radius)
+    evidence = outline_evidence(short, True, 0.25, pipe_views, [], np.zeros(len(pipe_views)), 0.5)
+    assert evidence is not None
+    step = evidence.along[1] - evidence.along[0]
+    assert evidence.log_odds[(evidence.along > 0) & (evidence.along < 0.1 - step)].min() > 0
+    assert evidence.log_odds[evidence.along > 0.1 + step].sum() < 0
+
+
+def test_no_evidence_without_a_pipe(empty_views: list[View]) -> None:
+    assert outline_evidence(PIPE, True, 0.2, empty_views, [], np.zeros(len(empty_views)), 0.5) is None

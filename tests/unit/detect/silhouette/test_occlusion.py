@@ -1,0 +1,51 @@
+"""Coarse depth images of a cloud: what stands before a surface hides it, the surface does not hide itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeprog_camera.camera import Camera
+from pipeprog_detect.silhouette.occlusion import BEFORE, behind, with_depths
+from pipeprog_detect.types import FloatArray, View
+
+
+@pytest.fixture
+def view() -> View:
+    """A camera at the origin that looks along z."""
+    camera = Camera.from_calibration(320, 180, [300.0, 0.0, 159.5, 0.0, 300.0, 89.5, 0.0, 0.0, 1.0], "plumb_bob", [])
+    return View(0, np.zeros((180, 320), np.uint8), camera, np.eye(4))
+
+
+def _plate(depth: float, left: float, right: float) -> FloatArray:
+    """Points (N, 3) every 4 mm of a plate across the view."""
+    x, y = np.meshgrid(np.arange(left, right, 0.004), np.arange(-0.5, 0.5, 0.004))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], axis=1)
+
+
+def _seen_at(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    depth = points[:, 2]
+    camera = view.camera
+    return points[:, :2] / depth[:, None] * camera.fx + np.array([camera.cx, camera.cy]), depth
+
+
+def test_a_plate_hides_what_lies_behind_it(view: View) -> None:
+    with_cloud = with_depths([view], np.concatenate([_plate(1.0, -0.6, 0.0), _plate(2.0, -1.0, 1.0)]))[0]
+    wall = np.array([[-0.6, 0.1, 2.0], [-0.2, 0.0, 2.0], [0.2, 0.0, 2.0], [0.6, -0.1, 2.0]])
+    assert behind(with_cloud, *_seen_at(view, wall)).tolist() == [True, True, False, False]
+    plate = np.array([[-0.4, 0.1, 1.0 + 0.8 * BEFORE], [-0.1, 0.0, 1.0 + 0.8 * BEFORE]])
+    assert not behind(with_cloud, *_seen_at(view, plate)).any()
+
+
+def test_without_a_cloud_nothing_is_hidden(view: View) -> None:
+    assert not behind(view, np.array([[100.0, 50.0]]), np.array([3.0])).any()
+    empty = with_depths([view], np.zeros((0, 3)))[0]
+    assert not behind(empty, np.array([[100.0, 50.0]]), np.array([3.0])).any()
+
+
+def test_a_slanted_surface_does_not_hide_itself(view: View) -> None:
+    share = np.linspace(0.0, 1.0, 4000)[:, None]
+    row = np.array([-0.4, 0.0, 1.0]) + share * np.array([0.8, 0.0, 3.0])
+    strip = np.concatenate([row + np.array([0.0, y, 0.0]) for y in np.arange(-0.1, 0.1, 0.004)])
+    seen = with_depths([view], strip)[0]
+    assert not behind(seen, *_seen_at(view, row[::50])).any()

@@ -1,0 +1,64 @@
+"""Thin pipes from where they are seen: pieces of one line, and the depth that the cloud gives it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeprog_detect.thin.depth_from_cloud import covers, laid, mean_centre
+from pipeprog_detect.thin.line_triangulation import SAME_LINE
+from pipeprog_detect.types import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE, WALL, front_points, wall_points
+
+
+def test_a_thin_pipe_is_laid_at_the_depth_of_the_points_before_the_wall() -> None:
+    thin = Cylinder(PIPE.start, PIPE.end, 0.0086)
+    centre = np.array([0.0, -1.2, 0.0])
+    sparse = front_points(thin)[::7]
+    deep = np.array([0.0, 0.05, 0.0])
+    proposed = Cylinder(centre + 1.05 * (thin.start - centre) + deep, centre + 1.05 * (thin.end - centre), thin.radius)
+    found = laid(proposed, np.concatenate([wall_points(), sparse]).astype(np.float32), centre)
+    assert found is not None
+    for end, true in ((found.start, thin.start), (found.end, thin.end)):
+        assert end[1] == pytest.approx(true[1], abs=thin.radius)
+    assert laid(proposed, np.zeros((0, 3), np.float32), centre) is None
+
+
+def test_the_wall_beside_and_behind_a_pipe_does_not_lay_it() -> None:
+    """Stereo keeps half of a thin pipe and draws the rest to the wall, up to it: the depth is that of the near half."""
+    thin = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    centre = np.array([0.0, -1.2, 0.0])
+    near = front_points(Cylinder(thin.start, thin.start + 0.5 * thin.length * thin.axis, thin.radius))[::7]
+    rng = np.random.default_rng(5)
+    drawn = np.stack([rng.uniform(0.0, 0.3, 400), rng.uniform(0.0, WALL, 400), rng.uniform(-0.009, 0.009, 400)], axis=1)
+    points = np.concatenate([wall_points(), near, drawn]).astype(np.float32)
+    proposed = Cylinder(np.array([-0.31, 0.04, 0.0]), np.array([0.31, 0.04, 0.0]), thin.radius)
+    found = laid(proposed, points, centre, sloping=False)
+    assert found is not None
+    assert found.start[1] == pytest.approx(thin.start[1], abs=thin.radius)
+    assert found.end[1] == pytest.approx(thin.end[1], abs=thin.radius)
+    assert laid(proposed, wall_points().astype(np.float32), centre) is None
+
+
+def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:
+    centre = mean_centre(PIPE, pipe_views)
+    assert centre is not None
+    assert centre[1] < -0.5
+    far = np.array([50.0, 0.0, 0.0])
+    assert mean_centre(Cylinder(PIPE.start + far, PIPE.end + far, PIPE.radius), pipe_views) is None
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(-3.0, 3.0), st.floats(0.85, 1.15), st.floats(-0.5, 1.0))
+def test_lines_are_pieces_of_one_pipe_by_what_the_image_shows(radii: float, farther: float, ahead: float) -> None:
+    """Whatever their depths: beside each other by less than the given radii, and no farther on than a clamp hides."""
+    one = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    centre = np.array([0.0, -1.2, 0.0])
+    moved = np.array([ahead, 0.0, radii * one.radius])
+    start, end = (centre + farther * (end + moved - centre) for end in (one.start, one.end))
+    other = Cylinder(start, end, one.radius)
+    for allowed in (SAME_LINE, 2.0):
+        if abs(abs(radii) - allowed) > 1e-3 and abs(ahead - 0.9) > 1e-3:
+            assert covers(one, other, centre, allowed) == (abs(radii) < allowed and ahead < 0.9)

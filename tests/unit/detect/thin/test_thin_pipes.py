@@ -1,0 +1,41 @@
+"""What runs parallel beside a pipe that was found by its lines tells its slope."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeprog_detect.thin.thin_pipes import aligned
+from pipeprog_detect.types import Cylinder, FloatArray
+from tests.unit.detect.straight_ahead import looking_along_y
+
+
+def level(length: float, slope: float = 0.0, turn: float = 0.0) -> Cylinder:
+    """A cylinder along x whose end lies `slope` [rad] towards the cameras and `turn` [rad] higher."""
+    axis = np.array([1.0, -np.tan(slope), np.tan(turn)])
+    half: FloatArray = 0.5 * length * axis / np.linalg.norm(axis)
+    return Cylinder(-half, half, 0.0086)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-0.2, 0.2), st.floats(0.005, 0.08))
+def test_a_slope_that_may_be_wrong_is_that_of_the_pipes_beside(slope: float, known_to: float) -> None:
+    """As sure as the proposal's own slope is, and five degrees in any case; its image, from straight ahead, stays."""
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    beside = [level(length) for length in (1.0, 2.0, 3.0)]
+    proposed = level(0.7, slope)
+    found, sigma = aligned(proposed, beside, views, known_to)
+    if abs(np.tan(slope)) < max(np.tan(np.radians(4.9)), 2.9 * known_to):
+        assert np.isfinite(sigma)
+        assert abs(found.axis @ beside[0].axis) > np.cos(1e-6)
+    elif abs(np.tan(slope)) > max(np.tan(np.radians(5.1)), 3.1 * known_to):
+        assert not np.isfinite(sigma)
+        assert found == proposed
+
+
+def test_what_runs_in_another_direction_in_the_image_is_not_parallel() -> None:
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    beside = [level(length, turn=np.radians(8.0)) for length in (1.0, 2.0, 3.0)]
+    assert not np.isfinite(aligned(level(0.7), beside, views, 0.1)[1])
+    assert not np.isfinite(aligned(level(0.7), [*beside[:2], level(1.0)], views, 0.1)[1])
