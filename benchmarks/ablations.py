@@ -30,10 +30,10 @@ from benchmarks.board_views import tracked
 from benchmarks.experiments import Case
 from benchmarks.recordings import Recording, named, site
 from benchmarks.survey import RESULTS, RUNS, attempt, commit
-from pipeprog_bringup.bag import Bag
-from pipeprog_bringup.cloud_io import read_cloud
-from pipeprog_bringup.results import read_trajectory
-from pipeprog_bringup.score import Result, Segment, align, read_truth, score
+from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.results.cloud_io import read_cloud
+from pipeprog_bringup.results.result_files import read_trajectory
+from pipeprog_bringup.results.scoring import Result, Segment, align, read_truth, score
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect

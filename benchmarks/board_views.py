@@ -27,9 +27,9 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import DEMO, ROOT, Recording, named
 from benchmarks.survey import RESULTS, RUNS, survey
-from pipeprog_bringup.bag import Bag
-from pipeprog_bringup.results import read_trajectory
-from pipeprog_bringup.score import score_files
+from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.results.result_files import read_trajectory
+from pipeprog_bringup.results.scoring import score_files
 from pipeprog_sfm.boards.board_file import load_targets
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.metric.metric_tracker import BoardTracker

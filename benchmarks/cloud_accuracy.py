@@ -19,8 +19,8 @@ from scipy.spatial import KDTree
 
 from benchmarks.recordings import Recording, named
 from benchmarks.survey import RESULTS, RUNS, survey
-from pipeprog_bringup.cloud_io import read_cloud
-from pipeprog_bringup.score import Truth, aligned, read_truth
+from pipeprog_bringup.results.cloud_io import read_cloud
+from pipeprog_bringup.results.scoring import Truth, aligned, read_truth
 
 FloatArray = NDArray[np.float64]
 

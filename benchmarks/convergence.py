@@ -27,7 +27,7 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import ROOT, Recording, made, named
 from benchmarks.survey import RESULTS
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
 from pipeprog_detect.cloud.axis_voting import Hypothesis
 from pipeprog_detect.cloud.candidate import Candidate, measure

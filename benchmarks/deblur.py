@@ -21,7 +21,7 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import made, site
 from benchmarks.survey import RESULTS
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import DeblurConfig, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer

@@ -29,10 +29,10 @@ from benchmarks import board_views
 from benchmarks.cloud_accuracy import cloud_accuracy
 from benchmarks.recordings import ROOT, Recording, site
 from benchmarks.survey import COMMAND, RESULTS, RUNS, attempt, commit
-from pipeprog_bringup import picture
-from pipeprog_bringup.cloud_io import read_cloud
-from pipeprog_bringup.score import score_files
-from pipeprog_bringup.survey_folder import read_survey
+from pipeprog_bringup.report import render
+from pipeprog_bringup.report.survey_reader import read_survey
+from pipeprog_bringup.results.cloud_io import read_cloud
+from pipeprog_bringup.results.scoring import score_files
 
 Known = dict[str, Any]
 
@@ -456,10 +456,10 @@ def _lines(
 def _pipes(run: Path) -> Any:
     """The pipes of a run in the colours of their classes, before the cloud: an image (H, W, 3) RGB."""
     results = read_survey(run)
-    pipes = [picture.ColoredPipe(results.cylinder(p), results.color(p["class"]), str(p["id"])) for p in results.pipes]
+    pipes = [render.ColoredPipe(results.cylinder(p), results.color(p["class"]), str(p["id"])) for p in results.pipes]
     file = read_cloud(run / "cloud.ply")
-    direction = picture.two_sides(file.cloud.points, pipes)[0]
-    return picture.draw(file.cloud.points, file.colors, pipes, direction, 900)
+    direction = render.two_sides(file.cloud.points, pipes)[0]
+    return render.draw(file.cloud.points, file.colors, pipes, direction, 900)
 
 
 if __name__ == "__main__":

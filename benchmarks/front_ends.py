@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeprog_bringup.score import Segment, match, relation
+from pipeprog_bringup.results.scoring import Segment, match, relation
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import Bill, PipeClass

@@ -64,9 +64,13 @@ HARMS = {
         "pipeprog_detect.cloud.candidate._facing", lambda _: lambda points, *_: points, "detect"
     ),
     "the mean of the errors for their root mean square": Harm(
-        "pipeprog_bringup.score._rms", lambda _: lambda values: float(np.mean(np.abs(values))), "bringup/test_score.py"
+        "pipeprog_bringup.results.scoring._rms",
+        lambda _: lambda values: float(np.mean(np.abs(values))),
+        "bringup/test_score.py",
     ),
-    "no end from rims": Harm("pipeprog_detect.silhouette.contour_refinement.find_end", lambda _: lambda *_, **__: None, "detect"),
+    "no end from rims": Harm(
+        "pipeprog_detect.silhouette.contour_refinement.find_end", lambda _: lambda *_, **__: None, "detect"
+    ),
 }
 
 

@@ -19,8 +19,8 @@ from sensor_msgs.msg import CompressedImage
 from benchmarks.motions import decoded, mapped
 from benchmarks.recordings import made, named
 from benchmarks.survey import RESULTS
-from pipeprog_bringup.bag import Bag
-from pipeprog_bringup.score import read_truth
+from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.results.scoring import read_truth
 from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.recordings import Recording, made, named
 from benchmarks.scale_sigma import decoded
 from benchmarks.survey import RESULTS
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import MapperConfig, SfmConfig

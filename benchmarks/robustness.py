@@ -27,7 +27,7 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import ROOT, Recording, made, site
 from benchmarks.survey import RESULTS, attempt
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 
 sys.path.insert(0, str(ROOT / "bags"))
 from sitegen.recording import camera_info, write_bag

@@ -22,7 +22,7 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import Recording, made, site
 from benchmarks.survey import RESULTS
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 from pipeprog_sfm.boards.board_file import load_targets
 from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import SfmConfig

@@ -25,7 +25,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import made, named
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_bringup.cloud_io import read_cloud
+from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect

@@ -20,7 +20,7 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import made, named
 from benchmarks.selector_cost import enlarged
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.feedback import Tie

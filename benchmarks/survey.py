@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from benchmarks.recordings import ROOT, Recording, made, named
-from pipeprog_bringup.score import score_files
+from pipeprog_bringup.results.scoring import score_files
 
 RESULTS = Path(__file__).parent / "results"
 RUNS = ROOT / "out" / "surveys"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeprog_bringup.graph import private_domain
+from pipeprog_bringup.playback.node_processes import private_domain
 
 _KEPT = contextlib.ExitStack()
 

@@ -11,8 +11,8 @@ import pytest
 
 from benchmarks.recordings import made, site
 from benchmarks.survey import COMMAND
-from pipeprog_bringup.results import read_trajectory
-from pipeprog_bringup.score import score_files
+from pipeprog_bringup.results.result_files import read_trajectory
+from pipeprog_bringup.results.scoring import score_files
 
 RECORDING = site("lab", 31, "--size=480p", "--seconds=8", "--fps=2.5", "--allow-hidden", "--robot")
 

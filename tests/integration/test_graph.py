@@ -24,9 +24,9 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pipeprog_bringup import cdr
-from pipeprog_bringup.bag import Bag, Frame
-from pipeprog_bringup.bag_writer import BagWriter
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag import Bag, Frame
+from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_node import messages, qos
 
 BAGS = Path(__file__).parents[2] / "bags"

@@ -23,9 +23,9 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
 
-from pipeprog_bringup import cdr
-from pipeprog_bringup.bag_writer import BagWriter
-from pipeprog_bringup.score import read_result
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.results.scoring import read_result
 from pipeprog_camera.camera import Camera
 
 ROOT = Path(__file__).parents[2]

@@ -108,8 +108,8 @@ def detect(
 ) -> None:
     """Find and classify the pipes of a metric point cloud."""
     from pipeprog_bringup.console import print_progress, share_bar
-    from pipeprog_bringup.detecting import detect_file
-    from pipeprog_bringup.drawn_plane import as_points
+    from pipeprog_bringup.detect_cloud import detect_file
+    from pipeprog_bringup.keyframe_plane import as_points
 
     cut = [] if plane is None else ["detect.front_end=planes", f"detect.plane={as_points(plane, cloud.parent)}"]
     with share_bar("detect") as report:
@@ -149,7 +149,7 @@ def board(
     force: Annotated[bool, typer.Option("--force", help="Replace the file that --out names.")] = False,
 ) -> None:
     """Write target boards and marks to print at true size, each with a ruler to check the print."""
-    from pipeprog_bringup.output import output_file
+    from pipeprog_bringup.results.atomic_output import output_file
     from pipeprog_sfm.boards.board_file import load_targets
     from pipeprog_sfm.boards.board_print import board_pdf
 
@@ -171,7 +171,7 @@ def score(
     import json
 
     from pipeprog_bringup.console import print_score
-    from pipeprog_bringup.score import score_files
+    from pipeprog_bringup.results.scoring import score_files
 
     figures = score_files(pipes, truth)
     if as_json:
@@ -192,7 +192,7 @@ def report(
 ) -> None:
     """Write one HTML page: progress of each class, pictures, trajectory, radii, all pipes."""
     from pipeprog_bringup.console import share_bar
-    from pipeprog_bringup.report import report as write
+    from pipeprog_bringup.report.page import report as write
 
     with share_bar("report") as show:
         target = write(folders, out, force, show)
@@ -201,7 +201,7 @@ def report(
 
 def main() -> None:
     """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
-    from pipeprog_bringup.graph import NodeFailure
+    from pipeprog_bringup.playback.node_processes import NodeFailure
     from pipeprog_camera.errors import InputError
 
     # As for Ctrl-C, what was started is ended and what was half written is removed.

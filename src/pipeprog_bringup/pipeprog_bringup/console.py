@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from pipeprog_bringup.passage import State
+    from pipeprog_bringup.playback.session import State
     from pipeprog_detect.product.classification import ClassProgress
     from pipeprog_detect.types import Pipe
 

@@ -13,9 +13,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pipeprog_bringup import cdr
-from pipeprog_bringup.bag_writer import BagWriter
-from pipeprog_bringup.output import output_file
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.results.atomic_output import output_file
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 

@@ -13,14 +13,14 @@ from pathlib import Path
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from pipeprog_bringup import results
-from pipeprog_bringup.bag import Bag
-from pipeprog_bringup.bag_writer import BagWriter
-from pipeprog_bringup.graph import NODE_MODULES, Graph, NodeFailure, private_domain
-from pipeprog_bringup.output import OutputFolder
-from pipeprog_bringup.overrides import as_parameters, effective
-from pipeprog_bringup.passage import Passage, State
-from pipeprog_bringup.survey_files import record_keyframes, record_survey, write_survey
+from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph, NodeFailure, private_domain
+from pipeprog_bringup.playback.session import Passage, State
+from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, write_survey
+from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.results import result_files
+from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_bill
 from pipeprog_detect.product.classification import ClassProgress
@@ -88,11 +88,11 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             record_keyframes(recording, bag, run.log)
         started = time.monotonic()
         pipes, classes = write_survey(folder, survey, run.log)
-        results.write_config(
+        result_files.write_config(
             folder.file("config.yaml"),
             {
                 **{node: dataclasses.asdict(config) for node, config in configs.items()},
-                "boq": results.bill_entries(bill),
+                "boq": result_files.bill_entries(bill),
                 "boards": [board.name for board in targets.boards],
                 "replay": {
                     "bag": str(request.bag),
@@ -115,7 +115,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             "seeds": {node: config.seed for node, config in configs.items() if hasattr(config, "seed")},
             "timings_s": {**run.timings, "write": time.monotonic() - started},
         }
-        results.write_run(folder, facts)
+        result_files.write_run(folder, facts)
     registered = status.keyframes_registered
     return Outcome(pipes, classes, run.log.considered, run.log.chosen, registered, losses)
 

@@ -10,7 +10,7 @@ from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import DEMO, Recording
 from benchmarks.robustness import Shot
-from pipeprog_bringup.bag import Bag
+from pipeprog_bringup.recording.bag import Bag
 
 
 @pytest.fixture

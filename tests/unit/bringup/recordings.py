@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from pipeprog_bringup import cdr
+from pipeprog_bringup.recording import cdr
 from pipeprog_camera.camera import Camera
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeprog_bringup.cloud_io import write_ply
+from pipeprog_bringup.results.cloud_io import write_ply
 from tests.unit.bringup.recordings import write_bag
 
 BOARDS = """boards:

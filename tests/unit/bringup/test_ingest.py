@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeprog_bringup import cdr
-from pipeprog_bringup.bag import Bag
 from pipeprog_bringup.ingest import START, Ingested, ingest, read_camera
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.errors import InputError
 
 FRAMES = 12

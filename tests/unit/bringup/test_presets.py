@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeprog_bringup.overrides import NODE_CONFIGS
 from pipeprog_bringup.parameters_doc import markdown
+from pipeprog_bringup.results.overrides import NODE_CONFIGS
 from pipeprog_node.settings import build, flatten
 
 ROOT = Path(__file__).parents[3]

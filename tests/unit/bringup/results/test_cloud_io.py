@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 
-from pipeprog_bringup.cloud_io import read_cloud, write_las, write_ply
+from pipeprog_bringup.results.cloud_io import read_cloud, write_las, write_ply
 from pipeprog_camera.errors import InputError
 
 RNG = np.random.default_rng(0)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeprog_bringup.bag import Bag
-from pipeprog_bringup.results import read_trajectory
+from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.results.result_files import read_trajectory
 from pipeprog_camera.errors import InputError
 
 _DRAWN = re.compile(r"\s*(\d+)\s*:(.*)")

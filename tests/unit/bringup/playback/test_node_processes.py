@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeprog_bringup.graph import Graph, NodeFailure, private_domain
+from pipeprog_bringup.playback.node_processes import Graph, NodeFailure, private_domain
 
 
 def wait_for_failure(graph: Graph) -> None:

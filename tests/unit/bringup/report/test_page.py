@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeprog_bringup import picture, results
-from pipeprog_bringup.cloud_io import write_ply
-from pipeprog_bringup.report import report
+from pipeprog_bringup.report import render
+from pipeprog_bringup.report.page import report
+from pipeprog_bringup.results import result_files
+from pipeprog_bringup.results.cloud_io import write_ply
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.types import Cylinder, Pipe
@@ -33,14 +34,14 @@ def survey(folder: Path, day: int = 0, length: float = 2.0, name: str = "DN<200>
         Pipe("p02", cylinder(0.8), 0.0002, None, 0.0, 2.5, 0.001, 900),
     ]
     classes = [ClassProgress(name, 0.1, 4.0, length, 25 * length)]
-    results.write_pipes(folder / "pipes.json", pipes, classes, results.Scale("board", 0.0004))
+    result_files.write_pipes(folder / "pipes.json", pipes, classes, result_files.Scale("board", 0.0004))
     wall = np.random.default_rng(0).uniform([-1, 0.15, -0.5], [2, 0.16, 2.5], (20_000, 3))
     write_ply(folder / "cloud.ply", wall, np.full((20_000, 3), 120, np.uint8))
     stamps = [START + day * DAY + i * 10**8 for i in range(5)]
     positions = np.c_[np.linspace(-1, 1, 5), np.full(5, -2.0), np.full(5, 1.5)]
-    results.write_trajectory(folder / "trajectory.tum", stamps, positions, np.tile([0.0, 0, 0, 1], (5, 1)))
+    result_files.write_trajectory(folder / "trajectory.tum", stamps, positions, np.tile([0.0, 0, 0, 1], (5, 1)))
     config = {"boq": [{"name": name, "color": "#ff0000"}]}
-    results.write_config(folder / "config.yaml", config)
+    result_files.write_config(folder / "config.yaml", config)
     (folder / "run.json").write_text(json.dumps({"frames_considered": 40, "keyframes": 5, "losses": ["bag <torn>"]}))
     return folder
 
@@ -68,7 +69,7 @@ class Balanced(HTMLParser):
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeprog_bringup.report.PICTURE_WIDTH", 200)
+    monkeypatch.setattr("pipeprog_bringup.report.page.PICTURE_WIDTH", 200)
 
 
 def silent(share: float, stage: str) -> None:
@@ -118,7 +119,7 @@ def test_a_run_with_pipes_json_alone(tmp_path: Path) -> None:
 
 def test_a_run_without_pipes(tmp_path: Path) -> None:
     folder = survey(tmp_path / "run")
-    results.write_pipes(folder / "pipes.json", [], [], results.Scale("cloud", 0.0))
+    result_files.write_pipes(folder / "pipes.json", [], [], result_files.Scale("cloud", 0.0))
     _, text = read(report([folder], tmp_path / "report.html", False, silent))
     assert "as the cloud has it" in text
 
@@ -143,17 +144,17 @@ def test_what_cannot_be_reported_is_an_error(tmp_path: Path) -> None:
 
 
 def test_the_nearer_surface_is_seen() -> None:
-    front = picture.ColoredPipe(cylinder(0.0), (1.0, 0.0, 0.0), "")
-    back = picture.ColoredPipe(Cylinder(np.array([0, 1.0, 0]), np.array([0, 1.0, 2]), 0.1), (0.0, 0.0, 1.0), "")
-    seen = picture.draw(np.empty((0, 3)), None, [back, front], np.array([0.0, -1.0, 0.0]), 300)
+    front = render.ColoredPipe(cylinder(0.0), (1.0, 0.0, 0.0), "")
+    back = render.ColoredPipe(Cylinder(np.array([0, 1.0, 0]), np.array([0, 1.0, 2]), 0.1), (0.0, 0.0, 1.0), "")
+    seen = render.draw(np.empty((0, 3)), None, [back, front], np.array([0.0, -1.0, 0.0]), 300)
     middle = seen[seen.shape[0] // 2, 150].astype(int)
     assert middle[0] > 150 > middle[2]
 
 
 def test_the_two_sides_are_those_from_which_the_pipes_are_seen() -> None:
     wall = np.random.default_rng(0).uniform([-2, 0.2, -1], [2, 0.21, 3], (20_000, 3))
-    pipes = [picture.ColoredPipe(cylinder(x), (1, 0, 0), "") for x in (-0.5, 0.5)]
-    first, second = picture.two_sides(wall, pipes)
+    pipes = [render.ColoredPipe(cylinder(x), (1, 0, 0), "") for x in (-0.5, 0.5)]
+    first, second = render.two_sides(wall, pipes)
     assert first[1] < 0
     assert second[1] < 0
     assert np.degrees(np.arccos(first[:2] @ second[:2])) >= 49

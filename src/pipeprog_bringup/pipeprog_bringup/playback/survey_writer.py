@@ -6,13 +6,14 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 
-from pipeprog_bringup import cdr, results
-from pipeprog_bringup.bag import Bag
-from pipeprog_bringup.bag_writer import BagWriter
-from pipeprog_bringup.cloud_io import write_las, write_ply
-from pipeprog_bringup.frame_log import FrameLog
-from pipeprog_bringup.output import OutputFolder
-from pipeprog_bringup.passage import LastMessages, calibration
+from pipeprog_bringup.playback.frame_log import FrameLog
+from pipeprog_bringup.playback.session import LastMessages, calibration
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.results import result_files
+from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.cloud_io import write_las, write_ply
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.types import Cylinder, Pipe
 from pipeprog_msgs import msg
@@ -25,21 +26,21 @@ def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> t
     """pipes.json, progress.csv, cloud.ply, cloud.las, trajectory.tum, frames.csv; returns what the first two hold."""
     pipes = [_pipe(pipe) for pipe in survey.pipes.pipes]
     classes = [_progress(entry) for entry in survey.pipes.classes]
-    scale = results.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
-    results.write_pipes(folder.file("pipes.json"), pipes, classes, scale)
-    results.write_progress(folder.file("progress.csv"), pipes, classes)
+    scale = result_files.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
+    result_files.write_pipes(folder.file("pipes.json"), pipes, classes, scale)
+    result_files.write_progress(folder.file("progress.csv"), pipes, classes)
     points, normals = messages.points_from_cloud(survey.cloud)
     colors = messages.colors_from_cloud(survey.cloud)
     write_ply(folder.file("cloud.ply"), points, colors, normals)
     write_las(folder.file("cloud.las"), points, colors, normals)
     poses = [pose.pose for pose in survey.poses.poses]
-    results.write_trajectory(
+    result_files.write_trajectory(
         folder.file("trajectory.tum"),
         [messages.stamp_ns(pose.header.stamp) for pose in survey.poses.poses],
         np.array([[p.position.x, p.position.y, p.position.z] for p in poses]),
         np.array([[p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w] for p in poses]),
     )
-    results.write_frames(folder.file("frames.csv"), log.rows())
+    result_files.write_frames(folder.file("frames.csv"), log.rows())
     return pipes, classes
 
 

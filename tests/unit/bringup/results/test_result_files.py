@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeprog_bringup import results
-from pipeprog_bringup.frame_log import FrameLog
-from pipeprog_bringup.output import OutputFolder
-from pipeprog_bringup.overrides import as_parameters, effective
+from pipeprog_bringup.playback.frame_log import FrameLog
+from pipeprog_bringup.results import result_files
+from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.types import Cylinder, Pipe
@@ -28,12 +28,12 @@ PIPE = Pipe(
     0.0011,
     20411,
 )
-SCALE = results.Scale("board", 0.0004)
+SCALE = result_files.Scale("board", 0.0004)
 CLASSES = [ClassProgress("DN100", 0.0575, 24.0, 11.3, 100 * 11.3 / 24)]
 
 
 def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
-    results.write_pipes(tmp_path / "pipes.json", [PIPE], CLASSES, results.Scale("board", 0.0004))
+    result_files.write_pipes(tmp_path / "pipes.json", [PIPE], CLASSES, result_files.Scale("board", 0.0004))
     assert json.loads((tmp_path / "pipes.json").read_text()) == {
         "frame_id": "map",
         "scale": {"source": "board", "sigma": 0.0004},
@@ -65,7 +65,7 @@ def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
 
 def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     pipe = Pipe("p01", PIPE.cylinder, float("nan"), None, 0.0, 2.6, 0.001, 3)
-    results.write_pipes(tmp_path / "pipes.json", [pipe], CLASSES, results.Scale("board", None))
+    result_files.write_pipes(tmp_path / "pipes.json", [pipe], CLASSES, result_files.Scale("board", None))
     content = json.loads((tmp_path / "pipes.json").read_text())
     assert content["pipes"][0]["class"] is content["pipes"][0]["radius_sigma"] is content["scale"]["sigma"] is None
 
@@ -73,7 +73,9 @@ def test_what_is_not_known_is_null(tmp_path: Path) -> None:
 def test_what_two_classes_explain_is_ambiguous_and_runs_are_told(tmp_path: Path) -> None:
     unsure = replace(PIPE, class_name=None, class_probability=0.6)
     beyond = Cylinder(PIPE.cylinder.end + np.array([0, 0.2, 0.2]), PIPE.cylinder.end + np.array([0, 1.2, 0.2]), 0.0575)
-    results.write_pipes(tmp_path / "pipes.json", [unsure, replace(PIPE, id="p04", cylinder=beyond)], CLASSES, SCALE)
+    result_files.write_pipes(
+        tmp_path / "pipes.json", [unsure, replace(PIPE, id="p04", cylinder=beyond)], CLASSES, SCALE
+    )
     content = json.loads((tmp_path / "pipes.json").read_text())
     assert [pipe["ambiguous"] for pipe in content["pipes"]] == [True, False]
     assert [pipe["class_kmeans"] for pipe in content["pipes"]] == ["DN100", "DN100"]
@@ -85,7 +87,7 @@ def test_what_two_classes_explain_is_ambiguous_and_runs_are_told(tmp_path: Path)
 
 
 def test_progress_csv(tmp_path: Path) -> None:
-    results.write_progress(tmp_path / "progress.csv", [PIPE, PIPE], CLASSES)
+    result_files.write_progress(tmp_path / "progress.csv", [PIPE, PIPE], CLASSES)
     with (tmp_path / "progress.csv").open() as stream:
         row = next(csv.DictReader(stream))
     assert row == {
@@ -102,8 +104,8 @@ def test_progress_csv(tmp_path: Path) -> None:
 @given(st.integers(0, 2**62))
 def test_stamps_survive_the_trajectory_to_the_nanosecond(tmp_path_factory: pytest.TempPathFactory, stamp: int) -> None:
     path = tmp_path_factory.mktemp("tum") / "trajectory.tum"
-    results.write_trajectory(path, [stamp], np.array([[1.0, -2.0, 3.0]]), np.array([[0.5, 0.5, 0.5, 0.5]]))
-    stamps, poses = results.read_trajectory(path)
+    result_files.write_trajectory(path, [stamp], np.array([[1.0, -2.0, 3.0]]), np.array([[0.5, 0.5, 0.5, 0.5]]))
+    stamps, poses = result_files.read_trajectory(path)
     assert stamps.tolist() == [stamp]
     np.testing.assert_allclose(poses[0], [[0, 0, 1, 1], [1, 0, 0, -2], [0, 1, 0, 3], [0, 0, 0, 1]], atol=1e-9)
 
@@ -111,14 +113,14 @@ def test_stamps_survive_the_trajectory_to_the_nanosecond(tmp_path_factory: pytes
 def test_run_json_lists_its_files(tmp_path: Path) -> None:
     with OutputFolder(tmp_path / "out") as folder:
         folder.file("pipes.json").write_text("{}")
-        results.write_run(folder, {"command": "detect"})
+        result_files.write_run(folder, {"command": "detect"})
     content = json.loads((tmp_path / "out" / "run.json").read_text())
     assert content["files"] == ["pipes.json", "run.json"]
     assert content["versions"]["numpy"] == np.__version__
 
 
-def row(stamp: int, chosen: bool = False, reason: str = "why") -> results.FrameRow:
-    return results.FrameRow(stamp, chosen, reason)
+def row(stamp: int, chosen: bool = False, reason: str = "why") -> result_files.FrameRow:
+    return result_files.FrameRow(stamp, chosen, reason)
 
 
 def test_the_frame_log_counts_what_is_on_its_way() -> None:
@@ -140,7 +142,9 @@ def test_a_second_decision_revokes_the_first() -> None:
     log.decide(row(1, True, "bridges"))
     log.overlap(1, 0.8, 0.7, 90, True)
     log.overlap(1, 0.9, 0.75, 100, True)
-    expected = results.FrameRow(1, True, "bridges", registered=True, overlap_n=0.9, cell_overlap=0.75, tie_points=100)
+    expected = result_files.FrameRow(
+        1, True, "bridges", registered=True, overlap_n=0.9, cell_overlap=0.75, tie_points=100
+    )
     assert log.rows() == [expected]
 
 

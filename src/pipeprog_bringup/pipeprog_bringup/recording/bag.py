@@ -9,8 +9,8 @@ from pathlib import Path
 
 import yaml
 
-from pipeprog_bringup import cdr
-from pipeprog_bringup.mcap_file import McapFile, Message
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.mcap_file import McapFile, Message
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 

@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pipeprog_bringup import results
-from pipeprog_bringup.cloud_io import read_cloud
-from pipeprog_bringup.output import OutputFolder
-from pipeprog_bringup.overrides import effective
+from pipeprog_bringup.results import result_files
+from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.cloud_io import read_cloud
+from pipeprog_bringup.results.overrides import effective
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import Bill, load_bill
@@ -18,7 +18,7 @@ from pipeprog_detect.product.classification import ClassProgress, progress
 from pipeprog_detect.types import Pipe
 
 # The file's own metres are the scale: none was measured, so nothing is added to the pipes' sigmas.
-SCALE = results.Scale("cloud", 0.0)
+SCALE = result_files.Scale("cloud", 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,10 +62,10 @@ def _write(
     config: DetectConfig,
     timings: dict[str, float],
 ) -> None:
-    results.write_pipes(folder.file("pipes.json"), detection.pipes, detection.classes, SCALE)
-    results.write_progress(folder.file("progress.csv"), detection.pipes, detection.classes)
-    results.write_config(
-        folder.file("config.yaml"), {"detect": dataclasses.asdict(config), "boq": results.bill_entries(bill)}
+    result_files.write_pipes(folder.file("pipes.json"), detection.pipes, detection.classes, SCALE)
+    result_files.write_progress(folder.file("progress.csv"), detection.pipes, detection.classes)
+    result_files.write_config(
+        folder.file("config.yaml"), {"detect": dataclasses.asdict(config), "boq": result_files.bill_entries(bill)}
     )
     facts = {
         "command": "detect",
@@ -75,4 +75,4 @@ def _write(
         "seeds": {"detect": config.seed},
         "timings_s": timings,
     }
-    results.write_run(folder, facts)
+    result_files.write_run(folder, facts)

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pipeprog_bringup.output import OutputFolder
+from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import Bill
 from pipeprog_detect.product.classification import ClassProgress, by_kmeans

@@ -14,15 +14,15 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from pipeprog_bringup import picture
-from pipeprog_bringup.results import read_trajectory
-from pipeprog_bringup.score import read_json
+from pipeprog_bringup.report import render
+from pipeprog_bringup.results.result_files import read_trajectory
+from pipeprog_bringup.results.scoring import read_json
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.types import Cylinder
 
 FloatArray = NDArray[np.float64]
 
-UNPLANNED: picture.Color = (0.55, 0.55, 0.58)
+UNPLANNED: render.Color = (0.55, 0.55, 0.58)
 # Stamps before this count from some other zero than 1970 (a video, a simulation).
 FIRST_CLOCK = 1_000_000_000 * 10**9
 
@@ -37,11 +37,11 @@ class Survey:
     classes: list[dict[str, Any]]
     scale: dict[str, Any]
     facts: dict[str, Any]
-    colors: dict[str, picture.Color]
+    colors: dict[str, render.Color]
     positions: FloatArray | None
     cloud: Path | None = field(default=None)
 
-    def color(self, name: str | None) -> picture.Color:
+    def color(self, name: str | None) -> render.Color:
         """Colour of a class, grey for pipes without one."""
         return self.colors.get(name or "", UNPLANNED)
 
@@ -93,7 +93,7 @@ def _time(stamps: NDArray, facts: dict[str, Any], folder: Path) -> datetime:
         return datetime.fromtimestamp((folder / "pipes.json").stat().st_mtime, timezone.utc)
 
 
-def _colors(config: Path, classes: Sequence[dict[str, Any]]) -> dict[str, picture.Color]:
+def _colors(config: Path, classes: Sequence[dict[str, Any]]) -> dict[str, render.Color]:
     """Colour of each class as config.yaml has it; without that, colours that can be told apart."""
     palette = mpl.color_sequences["tab10"]
     colors = {str(entry["class"]): tuple(palette[i % 10]) for i, entry in enumerate(classes)}

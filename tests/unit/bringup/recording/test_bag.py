@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
-from pipeprog_bringup import cdr
-from pipeprog_bringup.bag import Bag, Motion
-from pipeprog_bringup.bag_writer import BagWriter, message_definition
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag import Bag, Motion
+from pipeprog_bringup.recording.bag_writer import BagWriter, message_definition
 from pipeprog_camera.errors import InputError
 from tests.unit.bringup.recordings import (
     CAMERA,

@@ -19,10 +19,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from pipeprog_bringup import cdr, results
-from pipeprog_bringup.bag import TF, TF_STATIC, Bag, Frame, Motion
-from pipeprog_bringup.frame_log import FrameLog
-from pipeprog_bringup.graph import Graph, NodeFailure
+from pipeprog_bringup.playback.frame_log import FrameLog
+from pipeprog_bringup.playback.node_processes import Graph, NodeFailure
+from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag import TF, TF_STATIC, Bag, Frame, Motion
+from pipeprog_bringup.results import result_files
 from pipeprog_camera.errors import InputError
 from pipeprog_msgs import msg, srv
 from pipeprog_node import messages, qos
@@ -288,7 +289,7 @@ class Passage:
     def _on_decision(self, message: msg.FrameDecision) -> None:
         self._moved = time.monotonic()
         self.log.decide(
-            results.FrameRow(
+            result_files.FrameRow(
                 messages.stamp_ns(message.header.stamp),
                 message.chosen,
                 message.reason,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeprog_bringup.drawn_plane import as_points
-from pipeprog_bringup.results import write_trajectory
+from pipeprog_bringup.keyframe_plane import as_points
+from pipeprog_bringup.results.result_files import write_trajectory
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.cloud.cutting_planes import parse_planes

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipeprog_bringup.results import FrameRow, write_frames, write_trajectory
-from pipeprog_bringup.score import Result, Segment, Trajectory, Truth, align, read_result, score, score_files
+from pipeprog_bringup.results.result_files import FrameRow, write_frames, write_trajectory
+from pipeprog_bringup.results.scoring import Result, Segment, Trajectory, Truth, align, read_result, score, score_files
 from pipeprog_camera.errors import InputError
 
 CLASSES = {"DN65": 0.0365, "DN100": 0.0575}

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import matplotlib as mpl
 import numpy as np
 
-from pipeprog_bringup.survey_folder import Survey
+from pipeprog_bringup.report.survey_reader import Survey
 
 mpl.use("Agg")
 from matplotlib import dates

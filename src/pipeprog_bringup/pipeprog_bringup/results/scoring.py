@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from pipeprog_bringup.results import read_frame_stamps, read_trajectory
+from pipeprog_bringup.results.result_files import read_frame_stamps, read_trajectory
 from pipeprog_camera.errors import InputError
 
 FloatArray = NDArray[np.float64]

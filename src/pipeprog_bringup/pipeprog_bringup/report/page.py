@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from pipeprog_bringup import picture, plots
-from pipeprog_bringup.cloud_io import read_cloud
-from pipeprog_bringup.output import output_file
-from pipeprog_bringup.survey_folder import UNPLANNED, Survey, read_survey
+from pipeprog_bringup.report import plots, render
+from pipeprog_bringup.report.survey_reader import UNPLANNED, Survey, read_survey
+from pipeprog_bringup.results.atomic_output import output_file
+from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_camera.errors import InputError
 
 PICTURE_WIDTH = 1000
@@ -180,14 +180,14 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _pictures(survey: Survey) -> str:
-    pipes = [picture.ColoredPipe(survey.cylinder(p), survey.color(p["class"]), str(p["id"])) for p in survey.pipes]
+    pipes = [render.ColoredPipe(survey.cylinder(p), survey.color(p["class"]), str(p["id"])) for p in survey.pipes]
     file = read_cloud(survey.cloud) if survey.cloud is not None else None
     points, colors = (np.empty((0, 3)), None) if file is None else (file.cloud.points, file.colors)
     if not len(points) and not pipes:
         return "<p>There is no cloud in this run and no pipe.</p>"
     images = []
-    for direction in picture.two_sides(points, pipes):
-        image = picture.draw(points, colors, pipes, direction, PICTURE_WIDTH)
+    for direction in render.two_sides(points, pipes):
+        image = render.draw(points, colors, pipes, direction, PICTURE_WIDTH)
         encoded = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 6])[1]
         source = base64.b64encode(encoded.tobytes()).decode()
         images.append(f'<img alt="cloud and pipes" src="data:image/png;base64,{source}">')
@@ -198,7 +198,7 @@ def _dot(color: str) -> str:
     return f'<span class="dot" style="background:{color}"></span>'
 
 
-def _css(color: picture.Color) -> str:
+def _css(color: render.Color) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in color)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict, deque
 from dataclasses import replace
 
-from pipeprog_bringup.results import FrameRow
+from pipeprog_bringup.results.result_files import FrameRow
 
 FAULTS = ("damaged", "stamp")  # how the reasons begin that lie in the recording, not in what it shows
 

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeprog_bringup.picture import ColoredPipe, draw
+from pipeprog_bringup.report.render import ColoredPipe, draw
 from pipeprog_detect.types import Cylinder
 
 AHEAD = np.array([0.0, -1.0, 0.2])

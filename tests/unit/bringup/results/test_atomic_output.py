@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeprog_bringup.output import OutputFolder, output_file
+from pipeprog_bringup.results.atomic_output import OutputFolder, output_file
 from pipeprog_camera.errors import InputError
 
 
