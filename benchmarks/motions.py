@@ -25,7 +25,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.feedback import Tie
-from pipeprog_frames.ring import Frame, FrameFile
+from pipeprog_frames.frame_buffer import Frame, FrameFile
 from pipeprog_frames.selector import Decision
 from pipeprog_frames.stream import Stream
 from pipeprog_sfm.config import SfmConfig

@@ -24,7 +24,7 @@ from pipeprog_bringup.recording.bag import Bag
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.feedback import Tie
-from pipeprog_frames.ring import Frame, FrameRing
+from pipeprog_frames.frame_buffer import Frame, FrameRing
 from pipeprog_frames.stream import Stream
 
 RESULTS = Path(__file__).parent / "results"

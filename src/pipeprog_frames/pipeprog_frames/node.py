@@ -18,8 +18,8 @@ from pipeprog_camera.errors import InputError
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
 from pipeprog_frames.feedback import Tie
-from pipeprog_frames.network import Network
-from pipeprog_frames.ring import Frame, FrameFile, FrameRing, FrameStore
+from pipeprog_frames.frame_buffer import Frame, FrameFile, FrameRing, FrameStore
+from pipeprog_frames.image_network import Network
 from pipeprog_frames.selector import DAMAGED, Decision, Load
 from pipeprog_frames.stream import Stream
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced, is_cut_off, reduction
-from pipeprog_frames.ring import Frame, FrameFile, FrameRing
+from pipeprog_frames.frame_buffer import Frame, FrameFile, FrameRing
 from pipeprog_frames.selector import Decision, FrameSelector, Load
 from pipeprog_frames.stream import Stream
 from pipeprog_frames.tracker import Tracker

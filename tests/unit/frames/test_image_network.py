@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeprog_frames.feedback import StreamFeedback, Tie
-from pipeprog_frames.network import START_PERIOD, Network
+from pipeprog_frames.image_network import START_PERIOD, Network
 from pipeprog_frames.selector import Decision
 
 FEATURES = 2000
