@@ -34,6 +34,7 @@ from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_bringup.results.result_files import read_trajectory
 from pipeprog_bringup.results.scoring import Result, Segment, align, read_truth, score
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -47,7 +48,6 @@ from pipeprog_sfm.boards.board_file import load_targets
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.reconstruction import Reconstruction
 
-FloatArray = NDArray[np.float64]
 Figures = dict[str, Any]
 
 BLURRED = "lab:41:size=480p:seconds=8:exposure-ms=8:allow-hidden"

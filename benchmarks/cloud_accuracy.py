@@ -21,8 +21,7 @@ from benchmarks.recordings import Recording, named
 from benchmarks.survey import RESULTS, RUNS, survey
 from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_bringup.results.scoring import Truth, aligned, read_truth
-
-FloatArray = NDArray[np.float64]
+from pipeprog_camera.arrays import FloatArray
 
 SAMPLE = 200_000  # points of the cloud that are measured
 NEIGHBOURS = 6  # surface points that tell the plane about a point of a wall

@@ -34,9 +34,10 @@ from pipeprog_detect.cloud.candidate import Candidate, measure
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 sys.path.insert(0, str(ROOT / "bags"))
+from pipeprog_camera.arrays import FloatArray
 from sitegen.primitives import cylinder, rectangle
 from sitegen.scan import scan
 from sitegen.site import CONCRETE, PIPE_MATERIALS

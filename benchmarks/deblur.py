@@ -15,13 +15,13 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import made, site
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import DeblurConfig, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
@@ -34,7 +34,6 @@ OPTIONS = ("--size=480p", "--seconds=2.6", "--allow-hidden")
 SEED = 41
 VARIANTS = ("as it is", "deblurred", "all deblurred")
 
-FloatArray = NDArray[np.float64]
 Encoded = dict[int, bytes]
 
 

@@ -32,12 +32,12 @@ from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper
 
 sys.path.insert(0, str(ROOT / "bags"))
+from pipeprog_camera.arrays import FloatArray
 from sitegen.lab import build_lab
 from sitegen.render import Lens, Scene, build_scene
 from sitegen.sensor import Sensor, compress, develop, expose
 from sitegen.walk import Walk, look
 
-FloatArray = NDArray[np.float64]
 Recorded = list[tuple[int, bytes]]
 
 SEED = 41

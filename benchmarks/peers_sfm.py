@@ -27,13 +27,13 @@ from benchmarks.recordings import Recording, made, named
 from benchmarks.scale_sigma import decoded
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import MapperConfig, SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.warm_up import warm_up
 
-FloatArray = NDArray[np.float64]
 Images = list[NDArray[np.uint8]]
 
 

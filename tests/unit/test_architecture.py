@@ -27,8 +27,27 @@ ALLOWED_IN_NODES = {"pipeprog_node", "pipeprog_msgs"}
 # The modules beside the cores' node.py that speak ROS.
 GLUE = {
     "pipeprog_node": {"parameters", "qos", "diagnostics", "messages", "main", "worker"},
-    "pipeprog_bringup": {"replay", "passage", "survey_files", "graph"},
+    "pipeprog_bringup": {"replay", "session", "survey_writer", "node_processes"},
 }
+# Inside a package: which folder may import which; modules beside node.py may import all of them,
+# and all may import config.py and types.py.
+FOLDERS = {
+    "pipeprog_sfm": {"sparse": set(), "boards": set(), "metric": {"boards"}, "dense": set()},
+    "pipeprog_detect": {
+        "cloud": set(),
+        "silhouette": {"cloud"},
+        "product": set(),
+        "verification": {"cloud", "silhouette", "product"},
+        "thin": {"cloud", "silhouette", "product", "verification"},
+    },
+    "pipeprog_bringup": {
+        "recording": set(),
+        "results": set(),
+        "report": {"results"},
+        "playback": {"recording", "results"},
+    },
+}
+SHARED = {"config", "types"}
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|launch(_ros)?|tf2_ros|ament_index_python")
 
 # Import name -> dependency in package.xml; None: no rosdep key, requirements.txt installs it.
@@ -88,6 +107,33 @@ def test_imports_cross_packages_in_one_direction(path: Path) -> None:
     if package in CORES and path.stem == "node":
         allowed |= ALLOWED_IN_NODES
     assert {name for name in imports(path) if name.startswith("pipeprog_")} <= allowed
+
+
+def modules_named(path: Path, package: str) -> set[str]:
+    """Modules and folders right below `package` that a file imports."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == package:
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{package}."):
+            names.add((node.module or "").split(".")[1])
+        elif isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith(f"{package}.")}
+    return names
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in MODULES if path.parent.name in FOLDERS.get(owner(path), ())], ids=ids
+)
+def test_folders_of_a_package_import_in_one_direction(path: Path) -> None:
+    folder = path.parent.name
+    assert modules_named(path, owner(path)) <= {folder, *FOLDERS[owner(path)][folder], *SHARED}
+
+
+@pytest.mark.parametrize("package", FOLDERS)
+def test_every_folder_of_a_package_has_its_rule(package: str) -> None:
+    folders = {path.parent.name for path in (ROOT / "src" / package / package).glob("*/__init__.py")}
+    assert folders == set(FOLDERS[package])
 
 
 @pytest.mark.parametrize("path", MODULES, ids=ids)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 
 # Number of coefficients that each ROS distortion model may carry.
@@ -18,8 +19,6 @@ DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
     "equidistant": (4,),
 }
 _ALIASES = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant", "none": "plumb_bob"}
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.candidate_search import THICKEST_LINE, Report, Search, is_pipe
 from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
@@ -19,7 +20,7 @@ from pipeprog_detect.silhouette.apparent_contour import viewing_direction
 from pipeprog_detect.silhouette.edge_support import own_outlines
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.thin.thin_pipes import find_lost
-from pipeprog_detect.types import Cloud, Cylinder, FloatArray, Pipe, View
+from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.keyframe_verifier import Jury
 from pipeprog_detect.verification.measured_pipe import Measured, joined
 from pipeprog_detect.verification.measurement_cache import Memory

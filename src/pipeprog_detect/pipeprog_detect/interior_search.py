@@ -10,12 +10,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import local_shape
 from pipeprog_detect.cloud.candidate import Candidate, settle
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.scene_context import Surroundings
 
 # Of all pairs of sites a hundredth lie on one pipe even where nine tenths of the sites are stray: 400 good ones remain.

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.types import FloatArray, View
+from pipeprog_detect.types import View
 
 # Decoded images kept [bytes]: 550 of 720p, 60 of 4K.
 _MOST_BYTES = 512 * 2**20

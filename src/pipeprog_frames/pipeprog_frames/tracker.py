@@ -9,11 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.corners import PointArray, corners
 from pipeprog_frames.decoding import GrayImage
-
-FloatArray = NDArray[np.float64]
 
 MIN_CORNERS = 30  # below this a hull and a median say nothing
 MIN_TRACKED = 10  # an affine map takes three: the rest are witnesses

@@ -12,13 +12,12 @@ from scipy.fft import irfft2, rfft2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.dense.dense_mapper import EncodedImage
 from pipeprog_sfm.sparse.features import extract
 from pipeprog_sfm.sparse.mapper import Mapper
-
-FloatArray = NDArray[np.float64]
 
 STEADY = 1_000_000_000  # ns between two poses that still tell the velocity between them: hand and gait sway faster
 TILES = 8  # across the image: the blur of a walk goes with one over the depth, which differs by twice in one image

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_sfm.boards.board_file import Targets
@@ -25,8 +26,6 @@ from pipeprog_sfm.metric.transform_tree import Motion
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.sparse.overlap import FrameTie
-
-FloatArray = NDArray[np.float64]
 
 
 class NotMetricError(Exception):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.types import Cylinder
 
 PIPE = Cylinder(np.array([0.01, 0.0, -0.2]), np.array([-0.01, 0.01, 0.2]), 0.04)
 WALL = 0.12  # y [m]

@@ -7,11 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import Bill, PipeClass
-from pipeprog_detect.types import Cloud, Cylinder, FloatArray, Pipe
+from pipeprog_detect.types import Cloud, Cylinder, Pipe
 
 CONFIG = DetectConfig()
 NOISE = 2e-3

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import Bill, PipeClass
-from pipeprog_detect.types import Cloud, Cylinder, FloatArray, Pipe
+from pipeprog_detect.types import Cloud, Cylinder, Pipe
 from sitegen.primitives import Primitive, box, cylinder, elbow, rectangle
 from sitegen.scan import scan
 from sitegen.site import CONCRETE, PIPE_MATERIALS

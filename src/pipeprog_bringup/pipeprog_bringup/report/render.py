@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
 
-FloatArray = NDArray[np.float64]
 Color = tuple[float, float, float]
 
 # Everything is drawn twice as large and reduced, which smooths the edges.

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from pipeprog_bringup.report import render
 from pipeprog_bringup.results.result_files import read_trajectory
 from pipeprog_bringup.results.scoring import read_json
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.types import Cylinder
-
-FloatArray = NDArray[np.float64]
 
 UNPLANNED: render.Color = (0.55, 0.55, 0.58)
 # Stamps before this count from some other zero than 1970 (a video, a simulation).

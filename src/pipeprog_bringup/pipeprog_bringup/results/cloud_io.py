@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.types import Cloud
-
-FloatArray = NDArray[np.float64]
 
 # Coarser coordinates than this cannot hold a pipe of 8.6 mm radius.
 RESOLUTION = 0.005

@@ -18,13 +18,12 @@ import yaml
 from numpy.typing import NDArray
 
 from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import Bill
 from pipeprog_detect.product.classification import ClassProgress, by_kmeans
 from pipeprog_detect.product.pipe_runs import PipeRun, pipe_runs
 from pipeprog_detect.types import Pipe
-
-FloatArray = NDArray[np.float64]
 
 FRAME_COLUMNS = (
     *("stamp", "chosen", "reason", "overlap_n", "overlap_predicted", "parallax", "sharpness", "registered"),

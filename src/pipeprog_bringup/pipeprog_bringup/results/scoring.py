@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from pipeprog_bringup.results.result_files import read_frame_stamps, read_trajectory
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 # When a detection is a pipe of the truth: axes nearer than the larger of the radius and 20 mm, angle under 3 degrees,
 # the common stretch over half of either length.

@@ -9,9 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud.cylinder_fit import basis
-from pipeprog_detect.cloud.octree import IntArray
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 
 _SECTORS = 36
 # A bin of the barrel is seen where its points cover this angle, a bin is empty under this share of its neighbours.

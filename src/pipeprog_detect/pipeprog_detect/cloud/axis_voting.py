@@ -8,10 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.local_shape import Surfaces
-from pipeprog_detect.cloud.octree import IntArray
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 
 # Votes agree on an axis within this angle (local directions scatter by 2 to 5 degrees), this share of the radius
 # across it, and this ratio of radii.

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.axial_extent import Run, straight_stretch, surface_runs
 from pipeprog_detect.cloud.axis_voting import Hypothesis, Sector
 from pipeprog_detect.cloud.cylinder_fit import CylinderFit, basis, covered_arc, fit_cylinder
 from pipeprog_detect.cloud.octree import Octree
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 
 _FIT_POINTS = 2500
 # Where a pipe goes on is seen on some of its points as well as on all.

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.types import Cylinder
 
 # Pieces of one pipe: axes within this angle, offset by this share of the radius (and what waviness may add
 # off), radii within this ratio.

@@ -9,13 +9,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.cloud import local_shape
 from pipeprog_detect.cloud.axis_voting import Hypothesis, line_votes, votes_of
 from pipeprog_detect.cloud.cylinder_fit import basis, fit_cylinder
 from pipeprog_detect.cloud.ellipse_search import Ellipse, find_ellipses
 from pipeprog_detect.cloud.octree import Octree
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 
 # Points this near to the plane are its section [m].
 SLAB = 0.01

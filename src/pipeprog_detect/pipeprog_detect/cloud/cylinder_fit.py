@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.types import Cylinder
 
 # Residuals beyond this many sigmas have no weight: what lies farther off a pipe is mostly another object.
 _CUT = 3.5

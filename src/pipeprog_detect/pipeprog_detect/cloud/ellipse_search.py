@@ -14,8 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from pipeprog_detect.cloud.octree import IntArray
-from pipeprog_detect.types import FloatArray
+from pipeprog_camera.arrays import FloatArray, IntArray
 
 # Five-point samples for which one is clean at 99 % where half of the points are stray.
 _SAMPLES = 146

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numba import njit
 
-from pipeprog_detect.cloud.octree import THREADS, IntArray, Octree, neighbour_runs
-from pipeprog_detect.types import FloatArray
+from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_detect.cloud.octree import THREADS, Octree, neighbour_runs
 
 # A quadric has six coefficients: twice as many points leave something to judge it by.
 _LEAST_POINTS = 12

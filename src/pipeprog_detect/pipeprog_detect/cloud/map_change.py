@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.types import Cylinder
 
 # Places are cells [m] with those next to them: an adjustment that moves the map by centimetres is no news.
 _CELL = 0.1

@@ -13,9 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_detect.types import FloatArray
-
-IntArray = NDArray[np.int64]
+from pipeprog_camera.arrays import FloatArray, IntArray
 
 # For loops over independent parts; what they give does not depend on it.
 THREADS = min(os.cpu_count() or 1, 8)

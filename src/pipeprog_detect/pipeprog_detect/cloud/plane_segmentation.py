@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_detect.cloud.octree import Cells, IntArray, Octree, decode, encode
-from pipeprog_detect.types import FloatArray
+from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_detect.cloud.octree import Cells, Octree, decode, encode
 
 # Real walls, and walls in real clouds, are flat to a millimetre over a few decimetres, no better.
 _WAVINESS = 1e-3

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.product.boq import Bill
-from pipeprog_detect.types import FloatArray, Pipe
+from pipeprog_detect.types import Pipe
 
 # A pipe farther than this from every nominal radius, in standard deviations of measurement and make, is none of them.
 _REJECT = 4.0

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.product.boq import Bill
-from pipeprog_detect.types import FloatArray, Pipe
+from pipeprog_detect.types import Pipe
 
 UNKNOWN_COLOR = (0.6, 0.6, 0.6)  # grey: no planned class
 LABEL_HEIGHT = 0.06  # [m] readable beside the thinnest pipe

@@ -8,7 +8,8 @@ from itertools import combinations, product
 
 import numpy as np
 
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.types import Cylinder
 
 # Axes that a fitting joins meet within this share of the radius, and what their measurement may be off by [m].
 _MISS, _LEAST_MISS = 0.3, 5e-3

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.silhouette.occlusion import behind
-from pipeprog_detect.types import Cylinder, FloatArray, View
-
-IntArray = NDArray[np.int64]
+from pipeprog_detect.types import Cylinder, View
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.apparent_contour import (
     Stations,
@@ -24,7 +25,7 @@ from pipeprog_detect.silhouette.global_search import distinct, vote
 from pipeprog_detect.silhouette.limb_edges import LimbEdges, estimate_blur, outline_edges, sideways
 from pipeprog_detect.silhouette.one_sided import SeenArc, lone_limb, precision, shows_both
 from pipeprog_detect.silhouette.pipe_ends import End, find_end
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # Pixels of outline that make one measurement: the mean over them tames texture, the line stays straight within.
 CHUNK = 12

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import Stations, frame, viewing_direction
 from pipeprog_detect.silhouette.limb_edges import SHARP, LimbEdges, outline_edges, sideways
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # An edge supports an outline that it meets within the sharpness of the image [px], ...
 NEAR = 0.6

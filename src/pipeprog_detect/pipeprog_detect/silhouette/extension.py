@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import frame, viewing_direction
 from pipeprog_detect.silhouette.edge_support import SupportProfile, hits, support_profile
 from pipeprog_detect.silhouette.limb_edges import outline_edges
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # A known length tells the direction well enough to look this far ahead, in its own lengths and in metres.
 AHEAD, FARTHEST = 1.0, 1.5

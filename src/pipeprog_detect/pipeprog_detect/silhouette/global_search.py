@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import qmc
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import Stations
 from pipeprog_detect.silhouette.limb_edges import WINDOW_OF_HALF_WIDTH, profiles
-from pipeprog_detect.types import FloatArray, View
+from pipeprog_detect.types import View
 
 
 def vote(

@@ -10,8 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.octree import THREADS
-from pipeprog_detect.types import FloatArray, View
+from pipeprog_detect.types import View
 
 # Cells across an image, and the points that fill them: some in each cell of a view that shows a seventh of them.
 COLUMNS, MOST_POINTS = 160, 1_200_000

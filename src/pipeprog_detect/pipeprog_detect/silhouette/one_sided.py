@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import Stations, stations, visible
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # An edge of texture agrees with an outline by chance in two views.
 MIN_VIEWS = 3

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import camera_centre, hidden, project
 from pipeprog_detect.silhouette.extension import Evidence, outline_evidence
 from pipeprog_detect.silhouette.limb_edges import LINEAR_LIGHT
 from pipeprog_detect.silhouette.occlusion import behind
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # The barrel's part that faces the camera steeply enough to resolve lengths on it.
 HALF_ARC, SECTORS, RAYS_PER_SECTOR = np.radians(70.0), 6, 4

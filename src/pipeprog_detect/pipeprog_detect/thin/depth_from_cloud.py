@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import camera_centre, inside
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # The cloud beside a thin pipe is looked at as far as so many of its widths.
 RELIEF_REACH = 4.0

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_detect.types import FloatArray
+from pipeprog_camera.arrays import FloatArray
 
 # Segments shorter than this [px] are texture more often than not.
 SHORTEST = 10.0

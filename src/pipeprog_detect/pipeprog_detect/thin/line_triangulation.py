@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import camera_centre, inside, project
 from pipeprog_detect.thin.depth_from_cloud import LAID_REACH, RELIEF_REACH, by_bin, covers, laid, robust_line, spanning
 from pipeprog_detect.thin.line_segments import Ribbons, ribbons, straight_edges
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # Lines are sought in views that differ by so much of the distance to what they see, and in no more than so many.
 STEP, MOST_VIEWS = 0.12, 120

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.axial_extent import Run
 from pipeprog_detect.cloud.candidate import Candidate, Evidence
 from pipeprog_detect.config import ContourConfig
@@ -18,7 +19,7 @@ from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, ref
 from pipeprog_detect.silhouette.edge_support import outline_support
 from pipeprog_detect.thin.depth_from_cloud import covers, laid, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import Measured, is_known, is_stub
 
 # Lines are followed up for so many pipes at most, beside so many of the cloud's points.

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.product.boq import Bill
@@ -15,7 +16,7 @@ from pipeprog_detect.silhouette.apparent_contour import showing
 from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, refine
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, outline_support
 from pipeprog_detect.silhouette.one_sided import SeenArc
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import Measured, is_known, is_stub
 from pipeprog_detect.verification.measurement_cache import Memory
 

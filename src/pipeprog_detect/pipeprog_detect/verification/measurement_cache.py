@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.collinear import near
 from pipeprog_detect.cloud.map_change import Novelty
 from pipeprog_detect.silhouette.apparent_contour import inside
 from pipeprog_detect.silhouette.contour_refinement import ContourFit
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # A candidate is the same while it moves by less than the cloud's own scatter [m] and a share of its radius.
 _MOVED, _CHANGED = 2e-3, 0.03

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.silhouette.apparent_contour import camera_centre, showing
 from pipeprog_detect.silhouette.extension import outline_evidence
 from pipeprog_detect.silhouette.limb_edges import SHARP
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 
 # An axis meets a plane at more than 30 deg, or it rather runs along it.
 MEETS = 0.5

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 
 LEAST_CIRCLES = 3  # circles that identify a board: fewer agree by chance
 SAME_PLACE = 0.1  # of a circle's radius: circles of two layouts closer than that are the same circle

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_covariance import (
@@ -17,7 +18,6 @@ from pipeprog_sfm.boards.board_covariance import (
     image_noise,
     variance_components,
 )
-from pipeprog_sfm.boards.conic import FloatArray
 from pipeprog_sfm.boards.placed_board import BoardView, PlacedBoard, Rows, circle_pixels, image_rows, project
 from pipeprog_sfm.boards.triangulation import cross_matrices
 from pipeprog_sfm.config import BoardConfig

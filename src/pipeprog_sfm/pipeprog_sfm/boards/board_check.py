@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board_covariance import cauchy_weights
-from pipeprog_sfm.boards.conic import FloatArray
 from pipeprog_sfm.boards.placed_board import PlacedBoard, circle_pixels, image_rows, project
 from pipeprog_sfm.config import BoardConfig
 

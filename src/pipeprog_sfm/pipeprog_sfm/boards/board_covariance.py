@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 
 # Errors as expected before any residual is seen, and how many residuals that knowledge is worth: of a centre from
 # fitted edges, and of a pose, in px at the board (its tie points, some 0.3 px each, are many).

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import LEAST_CIRCLES, Board, BoardObservation, layouts, symmetries
 from pipeprog_sfm.boards.board_pose import BoardFit, misfit, refined, three_point_poses
-from pipeprog_sfm.boards.conic import FloatArray, circle_centre_images, circles_from_conics, project_circles
+from pipeprog_sfm.boards.conic import circle_centre_images, circles_from_conics, project_circles
 from pipeprog_sfm.boards.ellipses import PROFILES, TargetEllipses
 
 MAX_CANDIDATES = 400  # ellipses considered in one image: a perforated sheet must not stall the search

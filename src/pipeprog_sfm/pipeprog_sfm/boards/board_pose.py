@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.board import Board
-from pipeprog_sfm.boards.conic import FloatArray, project_circles
+from pipeprog_sfm.boards.conic import project_circles
 from pipeprog_sfm.boards.ellipses import TargetEllipses
 
 

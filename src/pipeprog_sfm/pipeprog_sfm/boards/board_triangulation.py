@@ -13,12 +13,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board, BoardObservation, layouts, symmetries
 from pipeprog_sfm.boards.board_adjustment import adjusted
 from pipeprog_sfm.boards.board_covariance import PRIOR_CENTRE, PRIOR_POSE
 from pipeprog_sfm.boards.board_detection import identify_predicted
-from pipeprog_sfm.boards.conic import FloatArray
 from pipeprog_sfm.boards.ellipses import TargetEllipses
 from pipeprog_sfm.boards.placed_board import BoardView, PlacedBoard, Rows, image_rows, project
 from pipeprog_sfm.boards.triangulation import LEAST_SINE, midpoints, similarity

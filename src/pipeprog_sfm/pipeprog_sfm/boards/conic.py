@@ -8,9 +8,8 @@ ellipse is (x - centre)^T M^-1 (x - centre) = 1. Everything here works on stacks
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pipeprog_camera.arrays import FloatArray
 
 
 def conic_from_ellipse(centres: FloatArray, shapes: FloatArray) -> FloatArray:

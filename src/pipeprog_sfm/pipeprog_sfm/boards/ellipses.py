@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.boards.conic import FloatArray, axes_and_angle, conic_from_ellipse
+from pipeprog_sfm.boards.conic import axes_and_angle, conic_from_ellipse
 from pipeprog_sfm.config import BoardConfig
 
 PROFILES = 64  # edge points of one ellipse: every centre is then known to about a sixth of the noise of an edge point

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board, BoardObservation
-from pipeprog_sfm.boards.conic import FloatArray, circle_centre_images
+from pipeprog_sfm.boards.conic import circle_centre_images
 from pipeprog_sfm.config import BoardConfig
 
 

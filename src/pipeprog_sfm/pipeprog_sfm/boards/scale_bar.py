@@ -14,10 +14,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board_file import MarkPair
 from pipeprog_sfm.boards.board_triangulation import place_circle
-from pipeprog_sfm.boards.conic import FloatArray, circles_from_conics, conic_score
+from pipeprog_sfm.boards.conic import circles_from_conics, conic_score
 from pipeprog_sfm.boards.ellipses import TargetEllipses
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.boards.triangulation import LEAST_SINE, midpoints

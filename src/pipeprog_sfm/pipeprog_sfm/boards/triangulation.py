@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 
 LEAST_SINE = np.sin(np.deg2rad(1.0))  # of the angle between two rays that give a point
 

@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
 from pipeprog_sfm.dense.stereo import DepthMap, StereoImage, choose_pairs, depth_map, working_image
-
-FloatArray = NDArray[np.float64]
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
 SUBMITTED = 2  # depth maps that stand before a fusion in the queue: more would only make the map wait

@@ -9,10 +9,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import FusionConfig
 from pipeprog_sfm.dense.stereo import DepthMap
-
-FloatArray = NDArray[np.float64]
 
 AGREEMENT = 0.01  # of the depth: views that agree this well have seen the same surface
 OVERLAP_MIN = 0.15  # share of a view that another one must see to be asked

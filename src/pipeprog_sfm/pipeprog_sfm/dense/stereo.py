@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import StereoConfig
 from pipeprog_sfm.dense.patch_refinement import refine
 from pipeprog_sfm.dense.plane_sweep import OVERSAMPLING, sweep
 
-FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 ByteImage = NDArray[np.uint8]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.metric.map_frame import Vertical
 
 STANDARD = 9.80665  # m/s^2

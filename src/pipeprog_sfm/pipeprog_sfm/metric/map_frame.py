@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.board import symmetries
-from pipeprog_sfm.boards.conic import FloatArray
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.metric.transform_tree import Path
 

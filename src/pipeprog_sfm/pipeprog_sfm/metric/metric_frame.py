@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
 from pipeprog_sfm.boards.board_adjustment import sensitivity
 from pipeprog_sfm.boards.board_check import BoardPlacement, contradiction, measure
 from pipeprog_sfm.boards.board_file import Targets
 from pipeprog_sfm.boards.board_triangulation import place_boards
-from pipeprog_sfm.boards.conic import FloatArray
 from pipeprog_sfm.boards.ellipses import TargetEllipses
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.boards.scale_bar import MarksError, find_marks

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
 from pipeprog_sfm.boards.board_detection import identify
 from pipeprog_sfm.boards.board_file import Targets
-from pipeprog_sfm.boards.conic import FloatArray
 from pipeprog_sfm.boards.ellipses import TargetEllipses, find_ellipses
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.metric.metric_frame import Evidence, estimate_scale

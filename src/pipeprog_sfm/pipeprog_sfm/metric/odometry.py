@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import OdometryConfig
 from pipeprog_sfm.metric.scale import Measurement, trajectory_gradient
 from pipeprog_sfm.metric.transform_tree import Path

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import OdometryConfig
 from pipeprog_sfm.metric.scale import Measurement
 from pipeprog_sfm.metric.transform_tree import NoPathError, TransformTree

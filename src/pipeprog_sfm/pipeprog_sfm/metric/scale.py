@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.board_adjustment import Sensitivity
 from pipeprog_sfm.boards.board_check import BoardPlacement
 from pipeprog_sfm.boards.board_file import Distance
-from pipeprog_sfm.boards.conic import FloatArray
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.boards.triangulation import cross_matrices
 from pipeprog_sfm.config import BoardConfig

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 
 LONGEST_GAP = 500_000_000  # ns between two poses that are interpolated: a walker's step
 ODOMETRY_FRAME = "odom"  # REP 105: continuous, while the frames above it may jump

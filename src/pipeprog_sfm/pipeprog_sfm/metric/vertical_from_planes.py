@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeprog_sfm.boards.conic import FloatArray
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.metric.map_frame import Vertical
 
 MOST_POINTS = 5000  # whose normals are estimated

@@ -16,8 +16,7 @@ import scipy.sparse.linalg
 from numba import njit
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from pipeprog_camera.arrays import FloatArray, IntArray
 
 DIFFERENCE = 1e-3  # px that residuals are moved by for their derivatives: far above rounding, far below their curvature
 HOLD = 1e6  # what holds a coordinate, in units of its pose's largest entry

@@ -14,9 +14,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-
-FloatArray = NDArray[np.float64]
 
 HALF_PIXEL = 0.5
 

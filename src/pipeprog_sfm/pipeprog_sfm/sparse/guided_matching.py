@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import MatchArray, match_guided
 from pipeprog_sfm.sparse.sparse_model import SparseModel
-
-IntArray = NDArray[np.int64]
 
 GUIDED_RADIUS = 4.0  # px around the epipolar segment
 TEMPORAL = 3  # neighbours in time that every keyframe is matched with

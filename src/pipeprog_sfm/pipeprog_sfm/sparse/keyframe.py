@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.sparse.features import Features
-
-FloatArray = NDArray[np.float64]
 
 GRID = (32, 18)
 

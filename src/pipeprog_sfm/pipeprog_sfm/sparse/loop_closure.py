@@ -5,14 +5,11 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
-from numpy.typing import NDArray
 from scipy.linalg import expm, logm
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS
 from pipeprog_sfm.sparse.sparse_model import SparseModel
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MAX_DRIFT = 0.05  # of the way since: what exceeds it is no drift but another place that looks alike
 

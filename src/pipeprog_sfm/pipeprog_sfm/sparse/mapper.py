@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.sparse.features import Features, extract
@@ -21,9 +22,6 @@ from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS, Location
 from pipeprog_sfm.sparse.retrieval import GLANCE, Retrieval
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.sparse.two_view import model_of_pair
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 COARSE = 1500  # strongest features that are matched without a prediction: enough for a pose, a seventh of the cost
 GLANCED = MIN_INLIERS * GLANCE // COARSE  # matches of so few features that make a full comparison worth while

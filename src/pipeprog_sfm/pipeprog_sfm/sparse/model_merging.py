@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.sparse.registration import MIN_INLIERS, Location
 from pipeprog_sfm.sparse.sparse_model import SparseModel
-
-FloatArray = NDArray[np.float64]
 
 DEPTH_TOLERANCE = 0.05  # of a point's depth in two models: its noise at the smallest angle
 

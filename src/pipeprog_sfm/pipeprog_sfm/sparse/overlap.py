@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import IntArray
 from pipeprog_sfm.sparse.keyframe import Keyframe, grid_cells, hull_area
 from pipeprog_sfm.sparse.sparse_model import SparseModel
-
-IntArray = NDArray[np.int64]
 
 NO_STAMP = -1
 

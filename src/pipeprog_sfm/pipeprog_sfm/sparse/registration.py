@@ -6,16 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_sfm.sparse.colmap import AbsolutePose, absolute_pose
 from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import MatchArray
 from pipeprog_sfm.sparse.sparse_model import SparseModel
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 POSE_ERROR = 4.0  # px, for RANSAC: the map's points move by a pixel or two before they are adjusted
 MIN_INLIERS = 20  # of a pose: far above what chance gives at this error

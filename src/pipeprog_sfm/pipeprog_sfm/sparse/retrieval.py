@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import IntArray
 from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import MatchArray, match
-
-IntArray = NDArray[np.int64]
 
 PAIRS_REMEMBERED = 2000  # of keyframes, whose matches are kept: 10 MB
 RETRIEVED = 6  # views of a model that a lost keyframe is compared with, others each time: the cost stays bounded

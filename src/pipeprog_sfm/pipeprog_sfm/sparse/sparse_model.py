@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covariance
 from pipeprog_sfm.sparse.tracks import NONE, digests, extend, filter_tracks, triangulate
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MAX_ERROR = 3.0  # px: the noise of SIFT is below 1 px, wrong matches are uniform in the search range
 NOISE_RANGE = (0.1, 1.0)  # px, of a coordinate: what image noise and SIFT's localisation allow

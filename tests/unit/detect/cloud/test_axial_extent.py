@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.axial_extent import straight_stretch, surface_runs
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 
 RADIUS = 0.05
 BARREL = Cylinder(np.zeros(3), np.array([0.0, 0.0, 1.0]), RADIUS)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.axis_voting import Hypothesis, Sector
 from pipeprog_detect.cloud.candidate import measure
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 
 LENGTH = 0.5
 ARC = np.radians(150.0)  # of the circumference that is seen, from +x

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.cutting_planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import Bill, PipeClass
-from pipeprog_detect.types import Cloud, Cylinder, FloatArray
+from pipeprog_detect.types import Cloud, Cylinder
 
 BILL = Bill(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (0.0086, 0.0365, 0.0575)))
 NOISE = 1e-3

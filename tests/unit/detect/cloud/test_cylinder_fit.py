@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.cylinder_fit import basis, covered_arc, fit_cylinder
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 
 LENGTH = 0.5
 

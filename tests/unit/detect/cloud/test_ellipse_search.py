@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.ellipse_search import components, confocal_distance, find_ellipses
-from pipeprog_detect.types import FloatArray
 
 SIGMA = 1e-3
 

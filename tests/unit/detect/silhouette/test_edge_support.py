@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import camera_centre
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, SupportProfile, outline_support, own_outlines, support
-from pipeprog_detect.types import Cylinder, FloatArray, View
+from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
 BEHIND = 0.012  # [m]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.silhouette.occlusion import BEFORE, behind, with_depths
-from pipeprog_detect.types import FloatArray, View
+from pipeprog_detect.types import View
 
 
 @pytest.fixture

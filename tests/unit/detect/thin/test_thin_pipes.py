@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.thin.thin_pipes import aligned
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 from tests.unit.detect.straight_ahead import looking_along_y
 
 

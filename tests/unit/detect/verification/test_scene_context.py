@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
-from pipeprog_detect.types import Cylinder, FloatArray
+from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.scene_context import Surroundings
 
 SIGMA = 5e-4

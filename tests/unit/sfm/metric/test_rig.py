@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from targets import CAMERA
-from tests.unit.sfm.test_motion import SECOND, Robot, pose_of, random_pose
 
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.metric.metric_frame import Evidence, estimate_scale
 from pipeprog_sfm.metric.rig import rig_measurements
 from pipeprog_sfm.metric.transform_tree import Transform, TransformTree
 from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
+from tests.unit.sfm.metric.test_transform_tree import SECOND, Robot, pose_of, random_pose
 
 PERFECT = OdometryConfig(baseline_sigma=0.0)
 LEFT_FROM_RIGHT = pose_of(Rotation.from_rotvec([0.02, -0.05, 0.01]), [0.20, 0.003, -0.002])
