@@ -9,24 +9,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.setting import setting
 from pipeprog_node.settings import build, describe, flatten, parse
 
 
 @dataclass(frozen=True)
 class Stereo:
-    max_pairs: int = field(default=2, metadata={"description": "neighbours", "unit": "", "range": (1, 8)})
-    method: str = field(default="sgm", metadata={"description": "matcher", "unit": "", "choices": ("sgm", "bm")})
+    max_pairs: int = setting(2, "neighbours", limits=(1, 8))
+    method: str = setting("sgm", "matcher", choices=("sgm", "bm"))
 
 
 @dataclass(frozen=True)
 class Config:
-    overlap_min: float = field(
-        default=0.85, metadata={"description": "least overlap", "unit": "", "range": (0.3, 0.99)}
-    )
-    lockstep: bool = field(default=False, metadata={"description": "wait", "unit": ""})
-    baseline: float | None = field(
-        default=None, metadata={"description": "known distance", "unit": "m", "range": (0, 9)}
-    )
+    overlap_min: float = setting(0.85, "least overlap", limits=(0.3, 0.99))
+    lockstep: bool = setting(False, "wait")
+    baseline: float | None = setting(None, "known distance", "m", (0, 9))
     stereo: Stereo = field(default_factory=Stereo)
 
 
