@@ -35,8 +35,9 @@ BOQ = "classes: [{name: DN65, outer_radius_mm: 36.5, planned_length_m: 3.0}]\n"
 RUNNER = """
 import sys
 from pathlib import Path
-from pipeprog_bringup import cli, graph, replay
-fakes = dict.fromkeys(graph.NODE_MODULES, "tests.integration.fake_node")
+from pipeprog_bringup import cli, replay
+from pipeprog_bringup.playback.node_processes import NODE_MODULES
+fakes = dict.fromkeys(NODE_MODULES, "tests.integration.fake_node")
 run = replay.replay
 replay.replay = lambda request, report: run(request, report, fakes)
 sys.argv[0] = "pipeprog"

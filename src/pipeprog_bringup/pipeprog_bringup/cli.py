@@ -61,6 +61,9 @@ def replay(
     imu_topic: Annotated[str | None, typer.Option(help="Which IMU, where there are several.")] = None,
 ) -> None:
     """Run the node graph on a recording: keyframes, metric map, classified pipes, progress."""
+    from pipeprog_bringup.playback.node_processes import require_ros
+
+    require_ros()
     from pipeprog_bringup.console import print_progress, replay_bars
     from pipeprog_bringup.replay import Request
     from pipeprog_bringup.replay import replay as run

@@ -145,13 +145,58 @@ def test_bad_input_is_1_and_says_what_is_wrong(folder: Path, arguments: tuple[st
     assert sorted(folder.rglob("*")) == before
 
 
+WITHOUT_ROS = """
+import re, sys
+from importlib.abc import MetaPathFinder
+class NoRos(MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if re.match(r"_?rclpy|\\w+_(msgs|interfaces)$", name.partition(".")[0]):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, NoRos())
+from pipeprog_bringup import cli
+sys.argv[0] = "pipeprog"
+cli.main()
+"""
+
+
+def pipeprog_without_ros(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", WITHOUT_ROS, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=120, check=False)
+
+
+def test_a_replay_without_ros_says_what_it_needs(folder: Path) -> None:
+    result = pipeprog_without_ros(folder, "replay", "bag.mcap", "--boq", "boq.yaml", "--out", "out")
+    assert result.returncode == 1
+    assert result.stderr.startswith("Error: a replay runs ROS 2 nodes, and this Python cannot import rclpy")
+    assert "make setup" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not (folder / "out").exists()
+
+
+def test_detect_score_report_and_board_work_without_ros(folder: Path) -> None:
+    (folder / "boards.yaml").write_text(BOARDS)
+    (folder / "truth.json").write_text(
+        json.dumps({"pipes": [{"start": [0, -0.1, 0], "end": [0, -0.1, 1.5], "radius": 0.0365}]})
+    )
+    for arguments in (
+        ("detect", "cloud.ply", "--boq", "boq.yaml", "--out", "out"),
+        ("score", "out/pipes.json", "truth.json"),
+        ("report", "out", "--out", "report.html"),
+        ("board", "boards.yaml", "--paper", "A3", "--out", "boards.pdf"),
+    ):
+        result = pipeprog_without_ros(folder, *arguments)
+        assert result.returncode == 0, result.stderr
+    assert (folder / "report.html").exists()
+
+
 def test_a_full_disk_is_told_and_leaves_nothing(folder: Path) -> None:
     """The second file fails to be written, as it would on a full disk."""
     code = (
         "import errno, pathlib, sys\n"
-        "from pipeprog_bringup import cli, results\n"
+        "from pipeprog_bringup import cli\n"
+        "from pipeprog_bringup.results import result_files\n"
         "def full(*arguments): raise OSError(errno.ENOSPC, 'No space left on device')\n"
-        "results.write_progress = full\n"
+        "result_files.write_progress = full\n"
         "sys.argv = ['pipeprog', *sys.argv[1:]]\n"
         "cli.main()\n"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import os
 import random
 import re
@@ -19,6 +20,8 @@ from typing import Any
 
 import yaml
 
+from pipeprog_camera.errors import InputError
+
 NODE_MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"}
 _STOP_SECONDS = 3.0
 _PR_SET_PDEATHSIG = 1
@@ -29,6 +32,19 @@ _DOMAINS = range(1, 101)
 
 class NodeFailure(Exception):
     """A node died, fell silent or could not do its work: the text names it."""
+
+
+def require_ros() -> None:
+    """Raises InputError where this Python cannot import ROS 2 or pipeprog's messages; the text says what is needed."""
+    for name in ("rclpy", "pipeprog_msgs.msg"):
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise InputError(
+                f"a replay runs ROS 2 nodes, and this Python cannot import {name} ({error}): run `make setup` in "
+                "pipeprog's repository and use .venv/bin/pipeprog, or source the setup.bash of a workspace in which "
+                "pipeprog is built; the other commands work without ROS"
+            ) from None
 
 
 class Graph:
