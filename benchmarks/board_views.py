@@ -69,8 +69,9 @@ def main(runs: Sequence[tuple[Path, Recording]]) -> None:
             rows.append(row)
             print(row)
     result = {
-        "title": f"Experiment 1: views of the board (pipes {', '.join(pipes)})",
+        "title": "Experiment 1: the scale from few views of the board",
         "command": "make experiments",
+        "pipes": pipes,
         "findings": _findings(rows),
         "rows": rows,
     }

@@ -4,7 +4,7 @@
 
 One scanned field site (58 pipes), scanned ever more densely; each size runs in a process of its own, for its memory.
 What is kept is in out/cost. Writes results/cost.json with an exponent for each stage: time grows as points to that
-power. How the mapper grows with the time of filming is benchmarks.growth.
+power. How the mapper grows with the time of filming is benchmarks.map_growth.
 """
 
 from __future__ import annotations

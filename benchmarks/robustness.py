@@ -5,7 +5,7 @@
 Every row is a recording of its own through the graph: rendered anew where the factor is in the scene or the camera's
 motion, made from the frames of the good recording where it is in the image or in its calibration. What was measured is
 kept in out/surveys, so that an interrupted run goes on. Writes results/robustness.json, docs/images/robustness.png; the
-recording guide is made of them (benchmarks.document).
+recording guide is made of them (benchmarks.write_accuracy).
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Time per keyframe as the map grows: ten minutes of walking along a corridor and back, a keyframe a second.
 
-    .venv/bin/python -m benchmarks.growth [MINUTES]
+    .venv/bin/python -m benchmarks.map_growth [MINUTES]
 
 The keyframes are made of features alone (points of the walls with descriptors of their own, noise of 0.3 px), so that
 what is timed is matching, registration, adjustment and bookkeeping; extraction and depth maps cost the same at any
 size of the map. Prints the CPU time per keyframe around each minute, global adjustments included, and writes
-results/growth.json beside this file.
+results/map_growth.json beside this file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.sparse.features import Features, root_sift
 from pipeprog_sfm.sparse.mapper import Mapper
 
-RESULTS = Path(__file__).parent / "results" / "growth.json"
+RESULTS = Path(__file__).parent / "results" / "map_growth.json"
 CAMERA = Camera(1280, 720, 900.0, 900.0, 639.5, 359.5)
 STEP = 0.3  # m between keyframes, 2 m from the wall: a tenth of the image
 DENSITY = 700  # points per metre of corridor, some 1500 in a view
@@ -79,7 +79,7 @@ def main(minutes: float) -> None:
         )
     print(facts)
     title = "CPU time per keyframe of the mapper as the map grows"
-    command = f"python -m benchmarks.growth {minutes:g}"
+    command = f"python -m benchmarks.map_growth {minutes:g}"
     RESULTS.write_text(json.dumps({"title": title, "command": command, "rows": rows, **facts}, indent=1) + "\n")
 
 

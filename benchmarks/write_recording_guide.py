@@ -1,0 +1,95 @@
+"""The recording guide, docs/recording.md: what to do on site, each advice with what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarks.markdown import bullets, cell, table
+
+Row = dict[str, Any]
+
+HEAD = """# How to film
+
+In short: walk slowly past the pipes at about two metres, sideways and not turning on the spot, with the board in view at the beginning and again at the end.
+Keep the exposure short, focus and exposure fixed, stabilisation and sharpening off, and calibrate the camera at the size that it films in.
+
+The tables below are of a generated lab (six pipes, 8.6 to 109.5 mm) filmed for 7.5 m of way at 480p, where a pipe of 8.6 mm at two metres is five pixels wide; one thing is spoiled at a time.
+Rendered, not real: they show what a single fault costs, not what a site will give.
+
+![F and radius error for each factor](images/robustness.png)
+"""  # noqa: E501
+
+# What to do, and why, for each factor; the figures come from the results.
+ADVICE = {
+    "resolution": (
+        "Film as large as the camera can, and calibrate at that size.",
+        "A radius follows from edges that are found to a fraction of a pixel, and a thin pipe must be several pixels "
+        "wide to be seen at all.",
+    ),
+    "speed [m/s], phone with 4 ms and 15 ms": (
+        "Walk at 0.2 m/s with a phone; with a global shutter and short exposure 0.75 m/s will do.",
+        "The phone of this table exposes for 4 ms and reads a frame out in 15 ms.\n"
+        "Blur grows with speed times exposure, skew with speed times read-out time, and a fast walk has fewer views of "
+        "each pipe.",
+    ),
+    "exposure [ms]": (
+        "Fix the exposure at 1/500 s or less; bring light rather than expose longer.",
+        "Blur along the walk widens the edges that lie across it.\n"
+        "Undoing it (`--set sfm.deblur.exposure=0.008`, where the exposure is known) has helped only after jolts: see "
+        "[deblurring](results/deblur.md).",
+    ),
+    "image noise [grey levels]": (
+        "Rather noise than blur: raise the gain before the exposure time.",
+        "Edges are averaged over hundreds of pixels and dozens of images, and noise averages out with them.",
+    ),
+    "JPEG quality": (
+        "Record JPEG at a quality of 90 or more, video at the highest bit rate.",
+        "Compression removes the fine texture by which images are matched before it moves an edge.",
+    ),
+    "distortion off, k1": (
+        "Calibrate the lens; switch a phone's own correction off, or calibrate with it.",
+        "k1 is the radial term that CameraInfo states wrongly here: 0.01 shifts a corner of the image by 3 pixels at "
+        "480p, 0.05 is a camera whose distortion nobody has measured.",
+    ),
+    "focal length off [%]": (
+        "Calibrate with fixed focus, and again after the camera has been dropped or refocused.",
+        "The board corrects the scale where it hangs; away from it the map bends.",
+    ),
+    "texture, 1 is rich": (
+        "On freshly painted walls have something with texture in view: floor, boxes, a few sheets of newspaper.",
+        "The camera's path is found by textured surroundings; the pipes themselves need no texture.",
+    ),
+    "distance [m]": (
+        "Stay about two metres away, nearer for pipes thinner than 20 mm.",
+        "Nearer, an image shows less than the whole length of a pipe; farther away, a thin pipe is only a few pixels "
+        "wide.",
+    ),
+    "rolling shutter [ms]": (
+        "Prefer a camera with a global shutter; with a rolling one, as phones have, walk at 0.2 m/s.",
+        "Rows of an image that are read at different times have different poses; the map takes them for one.\n"
+        "A board that is skewed by this contradicts its file, and a scale that may be wrong is refused.\n"
+        "This table is of 0.75 m/s; slower walks are under speed.",
+    ),
+}
+COLUMNS = ("right class", "false", "F", "radius RMSE [mm]", "length error [%]", "scale error [%]")
+
+
+def guide(result: dict[str, Any] | None) -> str:
+    """The text; a factor without a figure says so."""
+    rows: Sequence[Row] = result["rows"] if result else ()
+    parts = [HEAD]
+    for factor, (what, why) in ADVICE.items():
+        parts.append(f"## {factor[0].upper()}{factor[1:]}\n\n**{what}**\n{why}\n")
+        measured = [row for row in rows if row["factor"] == factor]
+        if not measured:
+            parts.append("Not measured yet.\n")
+            continue
+        cells = [[f"**{row['value']}**", *(cell(row.get(column)) for column in COLUMNS)] for row in measured]
+        parts.append(table(["", *COLUMNS], cells))
+        failed = [
+            f"{row['value']}: no result: {row['why'].removeprefix('Error: ')}" for row in measured if "why" in row
+        ]
+        parts += [bullets(failed)] * bool(failed)
+    command = result["command"] if result else "python -m benchmarks.robustness"
+    return "\n".join([*parts, f"Measured by `{command}`, written by `python -m benchmarks.write_accuracy`.\n"])
