@@ -15,9 +15,12 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, CompressedImage
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu
+from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.camera import Camera
 from pipeprog_msgs import msg
@@ -113,6 +116,22 @@ def test_a_live_reconstruction_goes_on_after_the_death_of_its_process(walk: Walk
     walk.wait_for(lambda: walk.status.keyframes_registered >= 6)  # the one that came as it died may be lost
     assert sfm.poll() is None
     assert worker(sfm) != first
+
+
+@pytest.mark.parametrize("sfm", ["true"], indirect=True)
+def test_the_status_counts_messages_of_motion_before_any_keyframe(walk: Walk, sfm: subprocess.Popen[str]) -> None:
+    motion = {
+        walk.node.create_publisher(Odometry, "odometry", qos.reliable(10)): Odometry(),
+        walk.node.create_publisher(Imu, "imu", qos.reliable(10)): Imu(),
+        walk.node.create_publisher(TFMessage, "/tf", qos.reliable(10)): TFMessage(transforms=2 * [TransformStamped()]),
+        walk.node.create_publisher(TFMessage, "/tf_static", qos.kept(10)): TFMessage(transforms=[TransformStamped()]),
+    }
+    walk.wait_for(walk.is_connected)
+    walk.wait_for(lambda: all(publisher.get_subscription_count() for publisher in motion))
+    for publisher, message in motion.items():
+        publisher.publish(message)
+    walk.wait_for(lambda: walk.status.motion_considered == 5)  # one of TF counts once for each of its transforms
+    assert walk.status.keyframes_seen == 0
 
 
 @pytest.mark.parametrize("sfm", ["true"], indirect=True)

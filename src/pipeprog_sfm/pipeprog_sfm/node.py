@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, Quaternion, Vector3
 from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
 from scipy.spatial.transform import Rotation
@@ -36,6 +37,7 @@ from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapRea
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
 MAX_VAIN_STARTS = 2  # of the worker that end before it has answered anything
+STATUS_PERIOD = 0.2  # s, at most, from a message of motion to the status that counts it
 MAX_MOTION = 1000  # samples of odometry, TF or IMU that wait for this process: seconds of the fastest
 
 
@@ -65,7 +67,7 @@ class SfmNode(Node):
         self._last_stamp = self._map_stamp = self._pose_stamp = 0
         self._transforms: list[Transform] = []  # since the last keyframe, as are the accelerations
         self._accelerations: list[Acceleration] = []
-        self._moved = 0
+        self._motion_considered = self._motion_told = 0  # messages of motion; told: in the last status
         self._map_frame = ""
         self._map_trajectory: Trajectory | None = None
         self._correction = 0.0  # of the last map: how far it has moved a keyframe, m
@@ -93,6 +95,9 @@ class SfmNode(Node):
         # In a group of its own: while it waits for the end, the other callbacks must run.
         self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
+        # Wall time: the status must follow while a paused recording stops ROS time.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._status_timer = self.create_timer(STATUS_PERIOD, self._tell_motion, clock=steady)
 
     def destroy_node(self) -> None:
         """Ends the worker with the node."""
@@ -142,7 +147,7 @@ class SfmNode(Node):
             self._move(transform.header, transform.child_frame_id, edge.translation, edge.rotation, static)
 
     def _move(self, header: Header, child: str, place: Point | Vector3, turn: Quaternion, static: bool = False) -> None:
-        self._moved += 1
+        self._motion_considered += 1
         values = np.array([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
         if not header.frame_id or not child or not np.isfinite(values).all() or not values[3:].any():
             self.get_logger().warning(
@@ -158,7 +163,7 @@ class SfmNode(Node):
         self._transforms.append(Transform(stamp, *names, pose, static))
 
     def _on_imu(self, message: Imu) -> None:
-        self._moved += 1
+        self._motion_considered += 1
         force = message.linear_acceleration
         values = np.array([force.x, force.y, force.z])
         # REP 145: -1 says that there are no accelerations.
@@ -289,7 +294,12 @@ class SfmNode(Node):
             messages.point_cloud(header, cloud.points, colors=cloud.colors, normals=cloud.normals, views=cloud.views)
         )
 
+    def _tell_motion(self) -> None:
+        if self._motion_told < self._motion_considered:
+            self._publish_status(self._status or Status())
+
     def _publish_status(self, status: Status) -> None:
+        self._motion_told = self._motion_considered
         scale = status.scale
         self._statuses.publish(
             msg.SfmStatus(
@@ -304,6 +314,7 @@ class SfmNode(Node):
                 metric=scale is not None,
                 scale_source=scale.source if scale else "",
                 scale_sigma=scale.sigma if scale else np.nan,
+                motion_considered=self._motion_considered,
                 message=status.message,
             )
         )
@@ -311,7 +322,7 @@ class SfmNode(Node):
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         status = self._status
         values: dict[str, Any] = {"keyframes": self._seen, "waiting": self._worker.backlog, "dropped": self._dropped}
-        values |= {"motion": self._moved}
+        values |= {"motion": self._motion_considered}
         if status is None:
             return DiagnosticStatus.OK, "waiting for keyframes" if self._ready else "starting", values
         values |= {

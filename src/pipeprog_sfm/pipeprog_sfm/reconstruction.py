@@ -36,13 +36,13 @@ class NotMetricError(Exception):
 class Status:
     """Health of the reconstruction; fields as in pipeprog_msgs/SfmStatus."""
 
-    seen: int
-    registered: int
-    waiting: int
-    models: int
-    reprojection_error: float
-    scale: ScaleEstimate | None
-    message: str
+    seen: int = 0
+    registered: int = 0
+    waiting: int = 0
+    models: int = 0
+    reprojection_error: float = 0.0
+    scale: ScaleEstimate | None = None
+    message: str = ""
 
 
 @dataclass(frozen=True)
