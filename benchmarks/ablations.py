@@ -44,7 +44,7 @@ from pipeprog_detect.types import Cloud, Pipe
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
 from pipeprog_frames.selector import FrameSelector
-from pipeprog_sfm.boards.board_file import load_targets
+from pipeprog_sfm.boards.board_file import load_board_file
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.reconstruction import Reconstruction
 
@@ -102,7 +102,7 @@ class Footage:
         self.camera: Camera = bag.camera
         self.encoded = {frame.stamp: bytes(deserialize_message(frame.data, CompressedImage).data) for frame in bag}
         self.bill = load_bill(recording.beside("boq.yaml"))
-        self.targets = load_targets(recording.beside("board.yaml"))
+        self.board_file = load_board_file(recording.beside("board.yaml"))
         self.truth = read_truth(recording.beside("truth.json"))
 
     def figures(self, found: list[Pipe], taken: Map, factor: float = 1.0) -> Figures:
@@ -142,7 +142,7 @@ class Footage:
 
     def map_of(self, stamps: list[int]) -> Map:
         """The map that these keyframes make."""
-        reconstruction = Reconstruction(SfmConfig(), self.targets)
+        reconstruction = Reconstruction(SfmConfig(), self.board_file)
         for stamp in stamps:
             reconstruction.add(stamp, self.encoded[stamp], self.camera)
         made = reconstruction.finish()

@@ -30,9 +30,9 @@ from benchmarks.survey import RESULTS, RUNS, survey
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.results.result_files import read_trajectory
 from pipeprog_bringup.results.scoring import score_files
-from pipeprog_sfm.boards.board_file import load_targets
+from pipeprog_sfm.boards.board_file import load_board_file
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.metric.metric_tracker import BoardTracker
+from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import NoScaleError
 
 CHOICES = 50  # as in the paper
@@ -145,11 +145,11 @@ def _rms(errors: np.ndarray) -> float:
     return round(float(np.sqrt(np.mean(errors**2))), 4)
 
 
-def tracked(run: Path, board: Path, corrected: bool) -> tuple[BoardTracker, dict[int, np.ndarray]]:
+def tracked(run: Path, board: Path, corrected: bool) -> tuple[MetricTracker, dict[int, np.ndarray]]:
     """The boards in the keyframes of a run, and the poses camera_from_map, by stamp, of those that see one."""
     bag = Bag.open(run / "out.mcap")
     config = dataclasses.replace(SfmConfig().board, eccentricity=corrected)
-    tracker = BoardTracker(load_targets(board), config)
+    tracker = MetricTracker(load_board_file(board), config)
     seeing = set()
     for frame in bag:
         encoded = np.frombuffer(deserialize_message(frame.data, CompressedImage).data, np.uint8)

@@ -24,10 +24,10 @@ from benchmarks.survey import RESULTS
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
-from pipeprog_frames.feedback import Tie
-from pipeprog_frames.frame_buffer import Frame, FrameFile
+from pipeprog_frames.feedback import OverlapReport
+from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile
 from pipeprog_frames.selector import Decision
-from pipeprog_frames.stream import Stream
+from pipeprog_frames.stream import KeyframeStream
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper
 
@@ -150,7 +150,7 @@ def survive(frames: Recorded) -> dict[str, Any]:
 def mapped(frames: Recorded, camera: Camera) -> tuple[list[int], Mapper]:
     """Stamps of the keyframes of a recording and the mapper that has worked them off, in lockstep with the selector."""
     ring, mapper, images = FrameFile(), Mapper(SfmConfig().mapper), dict(frames)
-    stream = Stream(FramesConfig(), camera, ring.middle)
+    stream = KeyframeStream(FramesConfig(), camera, ring.sharpest_between)
     changes: deque[Decision] = deque()
     keyframes: set[int] = set()
 
@@ -166,21 +166,21 @@ def mapped(frames: Recorded, camera: Camera) -> tuple[list[int], Mapper]:
             changes.extend(stream.answer(_ties(mapper)))
 
     for stamp, encoded in frames:
-        ring.add(Frame(stamp, "camera", encoded, camera))
+        ring.add(EncodedFrame(stamp, "camera", encoded, camera))
         decisions = stream.consider(stamp, partial(decode_reduced, encoded, camera.width))
         changes.extend(decision for decision in decisions if decision.chosen)
         work_off()
     changes.extend(decision for decision in stream.flush() if decision.chosen)
     work_off()
-    while changes := deque(stream.settle()):
+    while changes := deque(stream.finish_round()):
         work_off()
     mapper.finish()
     return sorted(keyframes), mapper
 
 
-def _ties(mapper: Mapper) -> list[Tie]:
+def _ties(mapper: Mapper) -> list[OverlapReport]:
     return [
-        Tie(tie.stamp, tie.registered, tie.overlap, tie.cell_overlap, tie.matches_previous, tie.matches_next)
+        OverlapReport(tie.stamp, tie.registered, tie.overlap, tie.cell_overlap, tie.matches_previous, tie.matches_next)
         for tie in mapper.ties()
     ]
 

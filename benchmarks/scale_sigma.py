@@ -23,10 +23,10 @@ from sensor_msgs.msg import CompressedImage
 from benchmarks.recordings import Recording, made, site
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.recording.bag import Bag
-from pipeprog_sfm.boards.board_file import load_targets
+from pipeprog_sfm.boards.board_file import load_board_file
 from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.metric.metric_tracker import BoardTracker
+from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import ScaleEstimate
 from pipeprog_sfm.sparse.mapper import Mapper
 
@@ -70,7 +70,10 @@ def main(seeds: int) -> None:
 def measure(recording: Recording, config: SfmConfig) -> tuple[ScaleEstimate, float, int]:
     """The estimate, its true relative error, and the number of images registered."""
     bag = Bag.open(recording.bag)
-    mapper, tracker = Mapper(config.mapper), BoardTracker(load_targets(recording.beside("board.yaml")), config.board)
+    mapper, tracker = (
+        Mapper(config.mapper),
+        MetricTracker(load_board_file(recording.beside("board.yaml")), config.board),
+    )
     stamps = []
     for frame in bag:
         gray = decoded(frame.data)

@@ -23,9 +23,9 @@ from benchmarks.selector_cost import enlarged
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
-from pipeprog_frames.feedback import Tie
-from pipeprog_frames.frame_buffer import Frame, FrameRing
-from pipeprog_frames.stream import Stream
+from pipeprog_frames.feedback import OverlapReport
+from pipeprog_frames.frame_buffer import EncodedFrame, FrameRing
+from pipeprog_frames.stream import KeyframeStream
 
 RESULTS = Path(__file__).parent / "results"
 WIDTH = 3840
@@ -52,7 +52,7 @@ def main() -> None:
     command = f"python -m benchmarks.stream_memory {arguments.recording} --minutes {arguments.minutes}"
     config = FramesConfig()
     ring = FrameRing(config.buffer_mib << 20)
-    stream = Stream(config, camera, ring.middle)
+    stream = KeyframeStream(config, camera, ring.sharpest_between)
     before, started = _resident_mib(), time.process_time()
     rows: list[dict[str, float | int]] = []
     chosen = 0
@@ -60,11 +60,11 @@ def main() -> None:
         stamp = SECOND + number * SECOND // FPS
         # As a message's bytes: a copy of their own.
         encoded = bytes(bytearray(images[there_and_back[number // REPEATED % len(there_and_back)]]))
-        ring.add(Frame(stamp, "camera", encoded, camera))
+        ring.add(EncodedFrame(stamp, "camera", encoded, camera))
         for decision in stream.consider(stamp, partial(decode_reduced, encoded, camera.width)):
             if decision.chosen:
                 chosen += 1
-                stream.answer([Tie(decision.stamp, True, 0.9, 0.9, 500, 500)])
+                stream.answer([OverlapReport(decision.stamp, True, 0.9, 0.9, 500, 500)])
         if (number + 1) % (60 * FPS) == 0:
             rows.append(
                 {

@@ -153,11 +153,11 @@ def board(
 ) -> None:
     """Write target boards and marks to print at true size, each with a ruler to check the print."""
     from pipeprog_bringup.results.atomic_output import output_file
-    from pipeprog_sfm.boards.board_file import load_targets
+    from pipeprog_sfm.boards.board_file import load_board_file
     from pipeprog_sfm.boards.board_print import board_pdf
 
-    targets = load_targets(boards)
-    pages = [*targets.boards, *(disc for pair in targets.marks for disc in pair.discs)]
+    content = load_board_file(boards)
+    pages = [*content.boards, *(disc for bar in content.scale_bars for disc in bar.discs)]
     document = board_pdf(pages, paper)
     with output_file(out, force) as file:
         file.write_bytes(document)

@@ -25,7 +25,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_bill
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.types import Pipe
-from pipeprog_sfm.boards.board_file import Targets, load_targets
+from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
         request.bag, request.image_topic, request.camera_info_topic, request.odometry_topic, request.imu_topic
     )
     bill = load_bill(request.boq)
-    targets = load_targets(request.board) if request.board else Targets()
+    board_file = load_board_file(request.board) if request.board else BoardFile()
     if request.rate is not None and not request.rate > 0:
         raise InputError(f"--rate {request.rate:g}: give a factor above zero, 1 for real time")
     if any(text.partition("=")[0].strip() == "frames.lockstep" for text in request.overrides):
@@ -93,7 +93,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             {
                 **{node: dataclasses.asdict(config) for node, config in configs.items()},
                 "boq": result_files.bill_entries(bill),
-                "boards": [board.name for board in targets.boards],
+                "boards": [board.name for board in board_file.boards],
                 "replay": {
                     "bag": str(request.bag),
                     "image_topic": bag.image_topic,

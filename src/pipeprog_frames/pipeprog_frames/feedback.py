@@ -13,11 +13,11 @@ MAX_BRIDGES = 3  # frames on each side of an image that does not register: the l
 LOOKAHEAD = 2  # later keyframes that a judgement waits for
 MIN_RUN = 4  # "groups of more than three"
 
-Middle = Callable[[int, int, Collection[int]], "int | None"]  # the best frame between two stamps, without some
+BestBetween = Callable[[int, int, Collection[int]], "int | None"]  # the best frame between two stamps, without some
 
 
 @dataclass(frozen=True)
-class Tie:
+class OverlapReport:
     """The SfM's answer for one keyframe: fields as in pipeprog_msgs/ImageOverlap."""
 
     stamp: int
@@ -34,7 +34,7 @@ class _Keyframe:
     overlap: float  # predicted, with the keyframe before it
     parallax: float
     fixed: bool = False  # asked for by feedback: never given back
-    tie: Tie | None = None
+    report: OverlapReport | None = None
     bridges: int = 0
     overlap_when_helped: float = -1.0
 
@@ -42,7 +42,7 @@ class _Keyframe:
 class StreamFeedback:
     """Keyframes so far, and what to change about them.
 
-    A keyframe is judged once the SfM has answered to the next two as well: the first of them ties the other half of
+    A keyframe is judged once the SfM has answered to the next two as well: the first of them connects the other half of
     what it shows, the second one makes points of it.
     It counts as loose when the lower of hull and cell overlap (Eq. 1 of the paper, and its version that a single stray
     feature cannot move) is below `overlap_min`. Of runs of more than three above `overlap_max` every second one is
@@ -51,7 +51,7 @@ class StreamFeedback:
     It ends: a frame that was added is never given back, one that was given back is never added again.
     """
 
-    def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, middle: Middle) -> None:
+    def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, middle: BestBetween) -> None:
         self._overlap_min, self._overlap_max, self._parallax_max = overlap_min, overlap_max, parallax_max
         self._middle = middle
         self._stamps: list[int] = []
@@ -62,14 +62,14 @@ class StreamFeedback:
         """Notes a keyframe that the selector has chosen."""
         self._insert(_Keyframe(decision.stamp, decision.overlap, decision.parallax))
 
-    def answer(self, ties: Iterable[Tie], complete: bool = False) -> list[Decision]:
+    def answer(self, reports: Iterable[OverlapReport], complete: bool = False) -> list[Decision]:
         """Takes the SfM's answers; returns the frames to add (chosen) and to give back (not chosen).
 
         `complete`: no more keyframes come, so the last one is judged as well.
         """
-        for tie in ties:
-            if tie.stamp in self._keyframes:
-                self._keyframes[tie.stamp].tie = tie
+        for report in reports:
+            if report.stamp in self._keyframes:
+                self._keyframes[report.stamp].report = report
         decisions: list[Decision] = []
         for stamp in list(self._stamps):
             if self._is_judged(stamp, complete):
@@ -93,26 +93,26 @@ class StreamFeedback:
         if index + LOOKAHEAD >= len(self._stamps) and not complete:
             return False
         around = self._stamps[max(index - 1, 0) : index + LOOKAHEAD + 1]
-        return all(self._keyframes[other].tie is not None for other in around)
+        return all(self._keyframes[other].report is not None for other in around)
 
     def _tighten(self, stamp: int) -> list[Decision]:
         keyframe = self._keyframes[stamp]
-        tie = keyframe.tie
-        assert tie is not None
+        report = keyframe.report
+        assert report is not None
         before, after = self._neighbours(stamp)
-        if not tie.registered:
+        if not report.registered:
             if keyframe.bridges >= MAX_BRIDGES:
                 return []
             keyframe.bridges += 1
             gaps = [(before, stamp), (stamp, after)]
             return [d for gap in gaps for d in self._fill(*gap, "bridges to a keyframe that did not register")]
-        overlap = min(tie.overlap, tie.cell_overlap)
+        overlap = min(report.overlap, report.cell_overlap)
         if overlap >= self._overlap_min or overlap < keyframe.overlap_when_helped + MIN_GAIN:
             return []
         keyframe.overlap_when_helped = overlap
         reason = f"beside an image with overlap {overlap:.2f} < {self._overlap_min:.2f}"
         gaps = [(before, stamp), (stamp, after)]
-        if tie.matches_next < tie.matches_previous:
+        if report.matches_next < report.matches_previous:
             gaps.reverse()
         for gap in gaps:
             added = self._fill(*gap, reason)
@@ -142,9 +142,9 @@ class StreamFeedback:
         return decisions
 
     def _is_ample(self, stamp: int) -> bool:
-        tie = self._keyframes[stamp].tie
-        assert tie is not None
-        return tie.registered and min(tie.overlap, tie.cell_overlap) > self._overlap_max
+        report = self._keyframes[stamp].report
+        assert report is not None
+        return report.registered and min(report.overlap, report.cell_overlap) > self._overlap_max
 
     def _give_back(self, stamp: int) -> list[Decision]:
         """Retires a keyframe, where the gap that it leaves is not one that the selector would have filled."""

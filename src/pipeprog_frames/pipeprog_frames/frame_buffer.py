@@ -19,7 +19,7 @@ CHOICE = 3  # frames nearest to the middle, of which the sharpest is taken: a st
 
 
 @dataclass(frozen=True)
-class Frame:
+class EncodedFrame:
     """One image as it came: stamp [ns], frame of the camera, JPEG or PNG bytes, calibration."""
 
     stamp: int
@@ -32,7 +32,7 @@ class FrameStore(ABC):
     """Frames by stamp."""
 
     def __init__(self) -> None:
-        self._frames: dict[int, Frame] = {}  # without their bytes
+        self._frames: dict[int, EncodedFrame] = {}  # without their bytes
         self._places: dict[int, tuple[int, int]] = {}  # of these: start, length
 
     @abstractmethod
@@ -43,7 +43,7 @@ class FrameStore(ABC):
     def _read(self, start: int, size: int) -> bytes:
         """The bytes that were stored there."""
 
-    def add(self, frame: Frame) -> None:
+    def add(self, frame: EncodedFrame) -> None:
         """Stores a frame whose stamp is later than all others; others are refused. Raises InputError on a full disk."""
         if self._frames and frame.stamp <= next(reversed(self._frames)):
             return
@@ -51,7 +51,7 @@ class FrameStore(ABC):
         self._frames[frame.stamp] = replace(frame, encoded=b"")
         self._places[frame.stamp] = start, len(frame.encoded)
 
-    def get(self, stamp: int) -> Frame | None:
+    def get(self, stamp: int) -> EncodedFrame | None:
         """The frame, if it is still held."""
         frame = self._frames.get(stamp)
         return replace(frame, encoded=self._read(*self._places[stamp])) if frame is not None else None
@@ -62,7 +62,7 @@ class FrameStore(ABC):
         gray = decode_reduced(frame.encoded, frame.camera.width) if frame else None
         return gray if gray is not None and len(corners(gray)) >= MIN_CORNERS else None
 
-    def middle(self, after: int, before: int, without: Collection[int] = ()) -> int | None:
+    def sharpest_between(self, after: int, before: int, without: Collection[int] = ()) -> int | None:
         """The stamp of the sharpest usable frame about the middle of the open interval, None when there is none."""
         stamps = list(self._frames)
         inside = [

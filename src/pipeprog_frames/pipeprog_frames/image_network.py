@@ -6,7 +6,7 @@ from bisect import insort
 from collections.abc import Iterable
 
 from pipeprog_frames.corners import corners
-from pipeprog_frames.feedback import MIN_RUN, Middle, Tie
+from pipeprog_frames.feedback import MIN_RUN, BestBetween, OverlapReport
 from pipeprog_frames.selector import DAMAGED, Decision, Load
 from pipeprog_frames.tracker import MIN_CORNERS
 
@@ -14,7 +14,7 @@ START_PERIOD = 2_000_000_000  # ns: 0.5 frames a second
 TOLERANCE = 1e-6  # of an overlap, which travels as a float of 32 bits
 
 
-class Network:
+class ImageNetwork:
     """Starts at 0.5 frames a second; each round adds and removes images by the overlap that the SfM has measured.
 
     A round: as long as an image does not register, it gets one frame before and one after. Then each image whose
@@ -26,13 +26,13 @@ class Network:
     most, and a round without a change is the last.
     """
 
-    def __init__(self, overlap_min: float, overlap_max: float, middle: Middle) -> None:
+    def __init__(self, overlap_min: float, overlap_max: float, middle: BestBetween) -> None:
         self._overlap_min, self._overlap_max = overlap_min, overlap_max
         self._middle = middle
         self._images: list[int] = []
         self._removed: set[int] = set()
         self._fixed: set[int] = set()
-        self._ties: dict[int, Tie] = {}
+        self._reports: dict[int, OverlapReport] = {}
         self._last_stamp: int | None = None
         self.rounds = 0
 
@@ -58,25 +58,25 @@ class Network:
         """Nothing: every frame was decided on as it came."""
         return []
 
-    def answer(self, ties: Iterable[Tie]) -> list[Decision]:
+    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
         """Takes what the SfM says about images that it has worked off; nothing changes before it has seen all."""
-        self._ties.update((tie.stamp, tie) for tie in ties)
+        self._reports.update((report.stamp, report) for report in reports)
         return []
 
-    def settle(self) -> list[Decision]:
+    def finish_round(self) -> list[Decision]:
         """One round, once the SfM has answered to all images: what to add (chosen), what to remove; none: the end."""
         decisions = self._connect() or self._fill() + self._thin()
         self.rounds += bool(decisions)
         return decisions
 
-    def verdict(self) -> list[Decision]:
+    def report_outside_band(self) -> list[Decision]:
         """The images that are not inside the band, each with the reason."""
         return [Decision(stamp, True, reason) for stamp in self._images if (reason := self._excuse(stamp))]
 
     def _overlap(self, stamp: int) -> float | None:
         """Eq. 1; None where the image is not registered."""
-        tie = self._ties.get(stamp)
-        return tie.overlap if tie is not None and tie.registered else None
+        report = self._reports.get(stamp)
+        return report.overlap if report is not None and report.registered else None
 
     def _gaps(self, stamp: int) -> list[tuple[int, int]]:
         """The image with its neighbour before and its neighbour after."""
@@ -95,7 +95,7 @@ class Network:
             if overlap is None or overlap >= self._overlap_min - TOLERANCE:
                 continue
             gaps = self._gaps(stamp)
-            if len(gaps) == 2 and self._ties[stamp].matches_next < self._ties[stamp].matches_previous:
+            if len(gaps) == 2 and self._reports[stamp].matches_next < self._reports[stamp].matches_previous:
                 gaps.reverse()
             reason = f"beside an image with overlap {overlap:.3f} < {self._overlap_min:.3f}"
             for gap in gaps:
@@ -112,7 +112,7 @@ class Network:
         insort(self._images, stamp)
         if stamp in self._removed:
             self._fixed.add(stamp)
-        self._ties.pop(stamp, None)
+        self._reports.pop(stamp, None)
         return [Decision(stamp, True, reason)]
 
     def _thin(self) -> list[Decision]:

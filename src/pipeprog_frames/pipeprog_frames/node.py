@@ -17,11 +17,11 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
-from pipeprog_frames.feedback import Tie
-from pipeprog_frames.frame_buffer import Frame, FrameFile, FrameRing, FrameStore
-from pipeprog_frames.image_network import Network
+from pipeprog_frames.feedback import OverlapReport
+from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
+from pipeprog_frames.image_network import ImageNetwork
 from pipeprog_frames.selector import DAMAGED, Decision, Load
-from pipeprog_frames.stream import Stream
+from pipeprog_frames.stream import KeyframeStream
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
@@ -43,13 +43,13 @@ class Policy(Protocol):
     def flush(self) -> list[Decision]:
         """Decides on the frames that are still open."""
 
-    def answer(self, ties: Iterable[Tie]) -> list[Decision]:
+    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
         """Takes the SfM's answers."""
 
-    def settle(self) -> list[Decision]:
+    def finish_round(self) -> list[Decision]:
         """What to change when all frames have come and the SfM has answered to all keyframes; nothing: the end."""
 
-    def verdict(self) -> list[Decision]:
+    def report_outside_band(self) -> list[Decision]:
         """What is to be said of single keyframes in the end."""
 
 
@@ -66,7 +66,7 @@ class FramesNode(Node):
         # In a replay the disk that holds the recording can hold its images, too.
         self._ring: FrameStore = FrameFile() if self._config.lockstep else FrameRing(self._config.buffer_mib << 20)
         self._queue: deque[Image | CompressedImage] = deque()
-        self._changes: deque[Frame | list[Decision]] = deque()  # keyframes to publish, keyframes to retire
+        self._changes: deque[EncodedFrame | list[Decision]] = deque()  # keyframes to publish, keyframes to retire
         self._feedback: deque[ImageOverlapArray] = deque()
         self._published: list[int] = []  # stamps in the order of publication
         self._acknowledged = self._retirements = self._acknowledged_retirements = self._lag = 0
@@ -110,8 +110,8 @@ class FramesNode(Node):
     def _make_policy(self, camera: Camera) -> Policy:
         overlap_min = self._config.overlap_min
         if self._config.policy == "network":
-            return Network(overlap_min, overlap_min + self._config.overlap_band, self._ring.middle)
-        return Stream(self._config, camera, self._ring.middle)
+            return ImageNetwork(overlap_min, overlap_min + self._config.overlap_band, self._ring.sharpest_between)
+        return KeyframeStream(self._config, camera, self._ring.sharpest_between)
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         self._queue.append(message)
@@ -148,7 +148,7 @@ class FramesNode(Node):
         """How far the SfM is behind, by the keyframe that it has answered to: a count would not forgive a lost one."""
         if answered in self._published:
             self._lag = len(self._published) - 1 - self._published.index(answered)
-        if isinstance(self._policy, Stream):
+        if isinstance(self._policy, KeyframeStream):
             self._policy.lag(self._lag)
 
     async def _on_finish(self, request: Finish.Request, response: Finish.Response) -> Finish.Response:
@@ -174,14 +174,14 @@ class FramesNode(Node):
         while self._publish_changes() and self._is_answered():
             self._apply_feedback(len(self._published))
             if self._policy is not None:
-                self._revise(self._policy.settle())
+                self._revise(self._policy.finish_round())
             if not self._changes:
                 self._end()
                 return
 
     def _end(self) -> None:
         assert self._finish is not None
-        verdict = self._policy.verdict() if self._policy is not None else []
+        verdict = self._policy.report_outside_band() if self._policy is not None else []
         for decision in verdict:
             self._announce(decision)
         if verdict:
@@ -201,7 +201,7 @@ class FramesNode(Node):
         stamp = messages.stamp_ns(message.header.stamp)
         encoded, load = self._open(message, self._camera)
         if encoded:
-            self._ring.add(Frame(stamp, message.header.frame_id, encoded, self._camera))
+            self._ring.add(EncodedFrame(stamp, message.header.frame_id, encoded, self._camera))
         self._decide(self._policy.consider(stamp, load if encoded else None))
 
     def _open(self, message: Image | CompressedImage, camera: Camera) -> tuple[bytes, Load]:
@@ -270,13 +270,13 @@ class FramesNode(Node):
                     return False
                 self._apply_feedback(len(self._published) + 1 - MAX_AHEAD)
             change = self._changes.popleft()
-            if isinstance(change, Frame):
+            if isinstance(change, EncodedFrame):
                 self._publish(change)
             else:
                 self._retire(change)
         return True
 
-    def _publish(self, frame: Frame) -> None:
+    def _publish(self, frame: EncodedFrame) -> None:
         self._published.append(frame.stamp)
         self._images.publish(messages.compressed_image(frame.stamp, frame.frame_id, frame.encoded))
         self._infos.publish(messages.info_from_camera(frame.camera, frame.stamp, frame.frame_id))
@@ -294,9 +294,9 @@ class FramesNode(Node):
     def _apply_feedback(self, count: int) -> None:
         """Uses the SfM's answers to the first `count` keyframes; later ones wait, so that a replay repeats itself."""
         while self._feedback and self._feedback[0].keyframes_considered <= count:
-            ties = [_tie(image) for image in self._feedback.popleft().images]
+            reports = [_report(image) for image in self._feedback.popleft().images]
             if self._policy is not None:
-                self._revise(self._policy.answer(ties))
+                self._revise(self._policy.answer(reports))
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         values = {
@@ -309,7 +309,7 @@ class FramesNode(Node):
         }
         if self._camera is None:
             return DiagnosticStatus.WARN, "no usable CameraInfo yet", values
-        if isinstance(self._policy, Stream) and self._policy.overlap_min < self._config.overlap_min:
+        if isinstance(self._policy, KeyframeStream) and self._policy.overlap_min < self._config.overlap_min:
             fewer = f"fewer keyframes, at an overlap of {self._policy.overlap_min:.2f}"
             return DiagnosticStatus.WARN, f"the SfM cannot keep up: {fewer}", values
         if self._dropped:
@@ -317,8 +317,8 @@ class FramesNode(Node):
         return DiagnosticStatus.OK, "selecting", values
 
 
-def _tie(image: ImageOverlap) -> Tie:
-    return Tie(
+def _report(image: ImageOverlap) -> OverlapReport:
+    return OverlapReport(
         messages.stamp_ns(image.stamp),
         image.registered,
         image.overlap,

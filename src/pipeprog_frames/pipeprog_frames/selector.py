@@ -14,13 +14,13 @@ from pipeprog_frames.tracker import MIN_CORNERS, Track, Tracker
 
 NAN = float("nan")
 DAMAGED = "damaged image"
-STRANGE = "shows nothing of the frames before and after it"
+UNMATCHED = "shows nothing of the frames before and after it"
 JUMP = "shows nothing of the frames before it"
 # The Laplacian's variance of neighbouring sharp frames differs by content alone by a fifth or so.
 BLUR_TOLERANCE = 0.8
 MAX_UNSEEN = 200_000_000  # ns between two looks: a turn of 90 degrees a second is caught within the tracker's reach
-RELIEVED_OVERLAP = 0.6  # below, neighbours alone no longer cover an image twice, which a point of the map takes
-RELIEVED_PARALLAX = 3.0  # times the usual one
+LOADED_OVERLAP = 0.6  # below, neighbours alone no longer cover an image twice, which a point of the map takes
+LOADED_PARALLAX = 3.0  # times the usual one
 
 Load = Callable[[], "GrayImage | None"]
 
@@ -80,13 +80,13 @@ class FrameSelector:
         self._last_stamp: int | None = None
         self._pace = 0.0  # share of the way to the next keyframe, per ns
         self._look_at = 0
-        self.relieve(0.0)
+        self.relax(0.0)
 
-    def relieve(self, relief: float) -> None:
+    def relax(self, relief: float) -> None:
         """Asks for fewer keyframes: 0 as configured, 1 as few as still make a map."""
         overlap = self._config.overlap_min
-        self.overlap_min = overlap - relief * max(overlap - RELIEVED_OVERLAP, 0.0)
-        self._parallax_max = self._parallax_base * (1 + relief * (RELIEVED_PARALLAX - 1))
+        self.overlap_min = overlap - relief * max(overlap - LOADED_OVERLAP, 0.0)
+        self._parallax_max = self._parallax_base * (1 + relief * (LOADED_PARALLAX - 1))
 
     def consider(self, stamp: int, load: Load | None) -> list[Decision]:
         """Takes the next frame; returns what is decided by it.
@@ -108,7 +108,7 @@ class FrameSelector:
     def flush(self) -> list[Decision]:
         """Decides on the frames that are still open: the last one ends the map, so it is kept if it adds anything."""
         decisions = self._catch_up(self._unseen.pop()) if self._unseen else []
-        decisions += [stranger.decided(False, STRANGE) for stranger in self._strangers]
+        decisions += [stranger.decided(False, UNMATCHED) for stranger in self._strangers]
         self._strangers.clear()
         return decisions + self._leave_window()
 
@@ -171,7 +171,7 @@ class FrameSelector:
         if not self._strangers:
             return []
         if candidate.track.tracked:
-            decisions = [stranger.decided(False, STRANGE) for stranger in self._strangers]
+            decisions = [stranger.decided(False, UNMATCHED) for stranger in self._strangers]
             self._strangers.clear()
             return decisions
         last = self._strangers[-1].gray
@@ -235,7 +235,7 @@ class FrameSelector:
         """Decides on a frame that neither the frames before it nor the next one know."""
         stranger = self._strangers.popleft()
         if self._strangers[0].stamp - stranger.stamp < MAX_UNSEEN:
-            return stranger.decided(False, STRANGE)
+            return stranger.decided(False, UNMATCHED)
         return stranger.decided(True, JUMP)
 
     def _leave_window(self) -> list[Decision]:

@@ -6,17 +6,17 @@ from collections.abc import Iterable
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.feedback import Middle, StreamFeedback, Tie
+from pipeprog_frames.feedback import BestBetween, OverlapReport, StreamFeedback
 from pipeprog_frames.selector import Decision, FrameSelector, Load
 
-EASY_LAG = 5  # keyframes that the SfM may be behind without being overloaded: it adjusts for seconds at times
+UNLOADED_LAG = 5  # keyframes that the SfM may be behind without being overloaded: it adjusts for seconds at times
 FULL_LAG = 25  # half of what its queue holds
 
 
-class Stream:
+class KeyframeStream:
     """FrameSelector and StreamFeedback together."""
 
-    def __init__(self, config: FramesConfig, camera: Camera, middle: Middle) -> None:
+    def __init__(self, config: FramesConfig, camera: Camera, middle: BestBetween) -> None:
         self._selector = FrameSelector(config, camera)
         parallax_max = config.parallax_max * camera.width
         self._feedback = StreamFeedback(
@@ -38,17 +38,17 @@ class Stream:
 
     def lag(self, keyframes: int) -> None:
         """Tells how many keyframes the SfM is behind: the further, the fewer are chosen."""
-        self._selector.relieve(min(max((keyframes - EASY_LAG) / (FULL_LAG - EASY_LAG), 0.0), 1.0))
+        self._selector.relax(min(max((keyframes - UNLOADED_LAG) / (FULL_LAG - UNLOADED_LAG), 0.0), 1.0))
 
-    def answer(self, ties: Iterable[Tie]) -> list[Decision]:
+    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
         """Takes the SfM's answers; returns frames to add (chosen) and to give back (not chosen)."""
-        return self._feedback.answer(ties)
+        return self._feedback.answer(reports)
 
-    def settle(self) -> list[Decision]:
+    def finish_round(self) -> list[Decision]:
         """What is to change when no frames come any more and the SfM has answered to all keyframes."""
         return self._feedback.answer((), complete=True)
 
-    def verdict(self) -> list[Decision]:
+    def report_outside_band(self) -> list[Decision]:
         """Nothing: a stream promises no band."""
         return []
 

@@ -27,10 +27,10 @@ from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
-from pipeprog_sfm.boards.board_file import Targets, load_targets
+from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.journal import Journal
-from pipeprog_sfm.metric.transform_tree import Acceleration, Motion, Transform
+from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
 from pipeprog_sfm.sparse.overlap import FrameTie
 from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Ready, Retire, Retired, serve
@@ -48,14 +48,14 @@ class SfmNode(Node):
         super().__init__("sfm")
         config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep"))
         board = str(self.declare_parameter("board", "").value)
-        targets = load_targets(board) if board else Targets()
+        board_file = load_board_file(board) if board else BoardFile()
         self._colmap = str(self.declare_parameter("colmap", "").value)
         lockstep = bool(self.declare_parameter("lockstep", False).value)
         # A replay that loses its reconstruction ends; on the robot it is begun anew.
         self._journal = None if lockstep else Journal()
         self._answered = 0  # commands of the journal
         self._vain_starts = 0
-        self._arguments = config, targets
+        self._arguments = config, board_file
         self._worker = self._start_worker()
         self._images: dict[tuple[int, str], CompressedImage] = {}  # by stamp and frame, as the calibrations
         self._cameras: dict[tuple[int, str], Camera] = {}
@@ -171,8 +171,8 @@ class SfmNode(Node):
             stamp = messages.stamp_ns(message.header.stamp)
             self._accelerations.append(Acceleration(stamp, message.header.frame_id.lstrip("/"), values))
 
-    def _take_motion(self) -> Motion:
-        motion = Motion(tuple(self._transforms), tuple(self._accelerations))
+    def _take_motion(self) -> RobotMotion:
+        motion = RobotMotion(tuple(self._transforms), tuple(self._accelerations))
         self._transforms, self._accelerations = [], []
         return motion
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.boards.board_file import Targets
+from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, EncodedImage, centre
 from pipeprog_sfm.dense.depth_fusion import FusedCloud
-from pipeprog_sfm.metric.metric_tracker import BoardTracker
+from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import NoScaleError, ScaleEstimate
-from pipeprog_sfm.metric.transform_tree import Motion
+from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.sparse.overlap import FrameTie
@@ -73,17 +73,17 @@ class MetricMap:
 class Reconstruction:
     """Sparse poses, scale, depth maps and fusion over a stream of keyframes."""
 
-    def __init__(self, config: SfmConfig, targets: Targets) -> None:
+    def __init__(self, config: SfmConfig, board_file: BoardFile) -> None:
         self._mapper = Mapper(config.mapper, config.seed)
         self._config = config
         self._deblurrer = Deblurrer(config, self._mapper)
-        self._targets = BoardTracker(targets, config.board, config.odometry)
+        self._metric_tracker = MetricTracker(board_file, config.board, config.odometry)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
         self._pending: tuple[ScaleEstimate, Trajectory, Future[FusedCloud]] | None = None
         self._scale: ScaleEstimate | None = None
         self._scaled = -1  # revision of the map that the scale was estimated in
-        self._sightings = 0  # keyframes that show a target
+        self._sightings = 0  # keyframes that show a board
         self._due = 0.0  # sightings at which the scale is estimated again
         self._reason = "no keyframe has been registered yet"
         self._problem = ""
@@ -99,8 +99,8 @@ class Reconstruction:
                 f"{camera.width} x {camera.height}: calibrate at the size that the camera sends"
             )
         self._images[stamp] = EncodedImage(encoded, camera)
-        # Features and targets are measured in the image as it is: their points are undistorted, not resampled.
-        self._sightings += bool(self._targets.add(stamp, gray, camera, frame))
+        # Features and boards are measured in the image as it is: their points are undistorted, not resampled.
+        self._sightings += bool(self._metric_tracker.add(stamp, gray, camera, frame))
         report = self._mapper.add(stamp, gray, camera)
         self._deblurrer.add(stamp, self._images[stamp])
         return report
@@ -110,9 +110,9 @@ class Reconstruction:
         poses = self._mapper.camera_from_model()
         self._dense.update(poses, self._images, self._mapper.points_seen, complete=False)
 
-    def move(self, motion: Motion) -> None:
+    def move(self, motion: RobotMotion) -> None:
         """Takes what odometry, TF and IMU have told since the last call."""
-        self._targets.move(motion)
+        self._metric_tracker.move(motion)
 
     def skip(self, stamp: int, problem: str) -> None:
         """Notes a keyframe that could not be used."""
@@ -125,7 +125,7 @@ class Reconstruction:
         """
         self._mapper.retire(stamps)
         self._deblurrer.retire(stamps)
-        self._targets.retire(stamps)
+        self._metric_tracker.retire(stamps)
         self._dense.retire(stamps)
         for stamp in stamps:
             self._images.pop(stamp, None)
@@ -209,7 +209,7 @@ class Reconstruction:
         return MetricMap(scale, trajectory, points)
 
     def _metric(self) -> tuple[ScaleEstimate, Trajectory]:
-        """The scale, estimated again when the map has moved or more of the targets was seen, and the metric poses."""
+        """The scale, estimated again when the map has moved or more of the boards was seen, and the metric poses."""
         # Its cost grows with the map: a pose must not wait for it at every keyframe in sight of a board.
         moved = self._scaled != self._mapper.revision
         if self._scale is None or moved or self._sightings >= self._due:
@@ -237,7 +237,7 @@ class Reconstruction:
         for number, piece in enumerate(pieces):
             first = next(iter(piece))
             try:
-                self._scale = self._targets.estimate(
+                self._scale = self._metric_tracker.estimate(
                     piece, partial(self._mapper.covariance, first), partial(self._mapper.points, first)
                 )
             except NoScaleError as error:

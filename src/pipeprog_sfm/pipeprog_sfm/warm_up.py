@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.boards.board_file import Targets
+from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.dense.depth_fusion import fuse
 from pipeprog_sfm.dense.stereo import StereoImage, depth_map
@@ -23,7 +23,7 @@ def warm_up(config: SfmConfig) -> None:
     camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2)
     wall = np.random.default_rng(0).integers(0, 256, (height // 4, width), np.uint8)
     wall = cv2.resize(wall, (4 * width, height), interpolation=cv2.INTER_CUBIC)
-    reconstruction = Reconstruction(config, Targets())
+    reconstruction = Reconstruction(config, BoardFile())
     views = []
     for number in range(5):
         gray = np.ascontiguousarray(wall[:, number * STEP :][:, :width])

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.boards.board_file import Targets
+from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.metric.transform_tree import Motion
+from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
 from pipeprog_sfm.sparse.overlap import FrameTie
 from pipeprog_sfm.warm_up import warm_up
@@ -30,7 +30,7 @@ class Keyframe:
     encoded: bytes
     camera: Camera
     frame: str = ""
-    motion: Motion = field(default_factory=Motion)
+    motion: RobotMotion = field(default_factory=RobotMotion)
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Retire:
 class Finish:
     """Command: no more keyframes come; publish the final map, and write the sparse model where a folder is named."""
 
-    motion: Motion = field(default_factory=Motion)
+    motion: RobotMotion = field(default_factory=RobotMotion)
     colmap: str = ""
 
 
@@ -90,12 +90,12 @@ class Finished:
 def serve(
     connection: Connection,
     config: SfmConfig,
-    targets: Targets,
+    board_file: BoardFile,
     answered: Iterable[Keyframe | Retire],
 ) -> None:
     """Works off commands from `connection` until it closes; those that a predecessor has answered come before."""
     warm_up(config)
-    reconstruction = Reconstruction(config, targets)
+    reconstruction = Reconstruction(config, board_file)
     for command in answered:
         _answer(reconstruction, command)
         reconstruction.update_dense()

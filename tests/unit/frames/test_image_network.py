@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeprog_frames.feedback import StreamFeedback, Tie
-from pipeprog_frames.image_network import START_PERIOD, Network
+from pipeprog_frames.feedback import OverlapReport, StreamFeedback
+from pipeprog_frames.image_network import START_PERIOD, ImageNetwork
 from pipeprog_frames.selector import Decision
 
 FEATURES = 2000
@@ -34,7 +34,7 @@ class Walk:
     def stamps(self) -> list[int]:
         return [1 + index * PERIOD for index in range(len(self.place))]
 
-    def middle(self, after: int, before: int, without: Collection[int]) -> int | None:
+    def sharpest_between(self, after: int, before: int, without: Collection[int]) -> int | None:
         stamps = self.stamps
         inside = [
             stamp
@@ -43,7 +43,7 @@ class Walk:
         ]
         return min(inside, key=lambda stamp: abs(2 * stamp - after - before), default=None)
 
-    def ties(self, images: Collection[int]) -> list[Tie]:
+    def reports(self, images: Collection[int]) -> list[OverlapReport]:
         """An image registers with half of it in common with a neighbour; tied is what one of the neighbours shows."""
         ordered = sorted(images)
         place = {stamp: self.place[(stamp - 1) // PERIOD] for stamp in ordered}
@@ -57,13 +57,15 @@ class Walk:
             overlap = min(sum(common), 1.0) if (shifts[0] < 0) != (shifts[1] < 0) else max(common)
             registered = max(common) > 0.3 and (stamp - 1) // PERIOD not in self.blind
             matches = [round(FEATURES * share) for share in common]
-            result.append(Tie(stamp, registered, overlap if registered else 0.0, overlap, *matches))
+            result.append(OverlapReport(stamp, registered, overlap if registered else 0.0, overlap, *matches))
         return result
 
 
-def run_network(walk: Walk, overlap_min: float, band: float = 0.025) -> tuple[Network, list[Tie], dict[int, int]]:
-    """The network at its end, the ties of its images, and how often each frame changed."""
-    network = Network(overlap_min, overlap_min + band, walk.middle)
+def run_network(
+    walk: Walk, overlap_min: float, band: float = 0.025
+) -> tuple[ImageNetwork, list[OverlapReport], dict[int, int]]:
+    """The network at its end, the reports of its images, and how often each frame changed."""
+    network = ImageNetwork(overlap_min, overlap_min + band, walk.sharpest_between)
     changes: dict[int, int] = {}
     images: set[int] = set()
 
@@ -76,10 +78,10 @@ def run_network(walk: Walk, overlap_min: float, band: float = 0.025) -> tuple[Ne
     for stamp in walk.stamps:
         apply([decision for decision in network.consider(stamp, lambda: TEXTURE) if decision.chosen])
     for _ in range(4 * len(walk.place)):
-        network.answer(walk.ties(images))
-        decisions = network.settle()
+        network.answer(walk.reports(images))
+        decisions = network.finish_round()
         if not decisions:
-            return network, walk.ties(images), changes
+            return network, walk.reports(images), changes
         apply(decisions)
     raise AssertionError("the network does not end")
 
@@ -91,7 +93,7 @@ def steady(seconds: float, speed: float) -> Walk:
 
 def test_the_network_starts_at_half_a_frame_a_second() -> None:
     walk = steady(20.0, 0.01)
-    network = Network(0.85, 0.875, walk.middle)
+    network = ImageNetwork(0.85, 0.875, walk.sharpest_between)
     chosen = [stamp for stamp in walk.stamps for d in network.consider(stamp, lambda: TEXTURE) if d.chosen]
     assert len(chosen) == 10
     assert np.diff(chosen).max() <= START_PERIOD + PERIOD
@@ -100,21 +102,23 @@ def test_the_network_starts_at_half_a_frame_a_second() -> None:
 @pytest.mark.parametrize("overlap_min", [0.7, 0.8, 0.9, 0.95])
 @pytest.mark.parametrize("speed", [0.05, 0.2, 0.5])
 def test_every_image_is_in_the_band_or_has_its_reason(overlap_min: float, speed: float) -> None:
-    network, ties, _ = run_network(steady(30.0, speed), overlap_min)
-    excused = {decision.stamp for decision in network.verdict()}
-    outside = {tie.stamp for tie in ties if not overlap_min <= tie.overlap <= overlap_min + 0.025}
+    network, reports, _ = run_network(steady(30.0, speed), overlap_min)
+    excused = {decision.stamp for decision in network.report_outside_band()}
+    outside = {report.stamp for report in reports if not overlap_min <= report.overlap <= overlap_min + 0.025}
     assert outside <= excused
-    assert not [tie for tie in ties[1:-1] if tie.overlap < overlap_min], "there are frames enough to fill every gap"
+    assert not [report for report in reports[1:-1] if report.overlap < overlap_min], (
+        "there are frames enough to fill every gap"
+    )
 
 
 def test_images_that_do_not_register_get_one_frame_before_and_one_after() -> None:
     walk = steady(8.0, 0.4)  # two seconds apart nothing is in common
-    network = Network(0.7, 0.725, walk.middle)
+    network = ImageNetwork(0.7, 0.725, walk.sharpest_between)
     images = {stamp for stamp in walk.stamps for d in network.consider(stamp, lambda: TEXTURE) if d.chosen}
-    ties = walk.ties(images)
-    assert not any(tie.registered for tie in ties)
-    network.answer(ties)
-    added = [decision.stamp for decision in network.settle()]
+    reports = walk.reports(images)
+    assert not any(report.registered for report in reports)
+    network.answer(reports)
+    added = [decision.stamp for decision in network.finish_round()]
     assert len(added) == 2 * len(images) - 2
     for first, second in pairwise(sorted(images)):
         assert sum(first < stamp < second for stamp in added) == 2
@@ -122,10 +126,10 @@ def test_images_that_do_not_register_get_one_frame_before_and_one_after() -> Non
 
 def test_a_slow_walk_loses_every_second_image_of_a_run() -> None:
     walk = steady(60.0, 0.01)
-    network = Network(0.7, 0.725, walk.middle)
+    network = ImageNetwork(0.7, 0.725, walk.sharpest_between)
     images = sorted({stamp for stamp in walk.stamps for d in network.consider(stamp, lambda: TEXTURE) if d.chosen})
-    network.answer(walk.ties(images))
-    gone = {decision.stamp for decision in network.settle() if not decision.chosen}
+    network.answer(walk.reports(images))
+    gone = {decision.stamp for decision in network.finish_round() if not decision.chosen}
     assert gone == set(images[1:-1:2])
 
 
@@ -150,7 +154,7 @@ def play(feedback: StreamFeedback, walk: Walk, chosen: list[int]) -> tuple[set[i
     changes: dict[int, int] = {}
 
     def settle(complete: bool) -> bool:
-        decisions = feedback.answer(walk.ties(images), complete)
+        decisions = feedback.answer(walk.reports(images), complete)
         for decision in decisions:
             assert decision.chosen == (decision.stamp not in images)
             images.symmetric_difference_update([decision.stamp])
@@ -169,7 +173,7 @@ def play(feedback: StreamFeedback, walk: Walk, chosen: list[int]) -> tuple[set[i
 def test_a_loose_image_gets_a_frame_on_its_looser_side() -> None:
     walk = Walk(np.r_[np.arange(40) * 0.005, 0.2 + np.arange(40) * 0.015])
     chosen = [walk.stamps[index] for index in (0, 20, 40, 79)]
-    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.middle), walk, chosen)
+    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between), walk, chosen)
     added = sorted(images - set(chosen))
     assert added
     assert min(added) > chosen[2], "the other gaps are dense enough"
@@ -177,21 +181,21 @@ def test_a_loose_image_gets_a_frame_on_its_looser_side() -> None:
 
 def test_a_gap_without_frames_and_a_stream_that_fits_change_nothing() -> None:
     walk = steady(10.0, 0.3)
-    _, changes = play(StreamFeedback(0.85, 0.875, 1e9, walk.middle), walk, walk.stamps[::15])
+    _, changes = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between), walk, walk.stamps[::15])
     assert not changes
     sparse = Walk(walk.place[::60])
-    _, changes = play(StreamFeedback(0.85, 0.875, 1e9, sparse.middle), sparse, sparse.stamps)
+    _, changes = play(StreamFeedback(0.85, 0.875, 1e9, sparse.sharpest_between), sparse, sparse.stamps)
     assert not changes
 
 
 def test_runs_that_overlap_too_much_lose_every_second_keyframe() -> None:
     walk = steady(10.0, 0.3)
     dense = walk.stamps[::5]  # 0.05 apart: two steps still overlap by 0.9
-    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.middle), walk, dense)
+    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between), walk, dense)
     assert len(images) < 0.6 * len(dense)
     place = walk.place[[(stamp - 1) // PERIOD for stamp in sorted(images)]]
     assert np.diff(place).max() <= 0.15 + 1e-9
-    near, _ = play(StreamFeedback(0.85, 0.875, 6.0, walk.middle), walk, dense)
+    near, _ = play(StreamFeedback(0.85, 0.875, 6.0, walk.sharpest_between), walk, dense)
     assert near == set(dense), "the parallax asks for each of them"
 
 
@@ -206,6 +210,6 @@ def test_nothing_is_added_and_retired_for_ever(
     steps: list[float], blind: frozenset[int], stride: int, overlap_min: float
 ) -> None:
     walk = Walk(np.cumsum(steps), blind)
-    feedback = StreamFeedback(overlap_min, overlap_min + 0.025, 1e9, walk.middle)
+    feedback = StreamFeedback(overlap_min, overlap_min + 0.025, 1e9, walk.sharpest_between)
     _, changes = play(feedback, walk, walk.stamps[::stride])
     assert set(changes.values()) <= {1}

@@ -122,7 +122,7 @@ def compressed(stamp: int, image: NDArray[np.uint8], kind: str = "jpeg", frame: 
     return message
 
 
-def tie(stamp: int, overlap: float, before: int, after: int) -> ImageOverlap:
+def report(stamp: int, overlap: float, before: int, after: int) -> ImageOverlap:
     return ImageOverlap(
         stamp=messages.time_msg(stamp),
         registered=True,
@@ -186,7 +186,7 @@ def test_live_a_lagging_sfm_gets_fewer_keyframes_and_people_are_told(
         scene.show(stamp, compressed(stamp, view(wall, 50 * index)))
         if scene.keyframes and index < 40:  # the SfM works off the first keyframe and no more
             first = scene.chosen()[0]
-            scene.answer(first, 1, [tie(first, 1.0, 0, 0)])
+            scene.answer(first, 1, [report(first, 1.0, 0, 0)])
     chosen = [(stamp - START) // 200_000_000 for stamp in scene.chosen()]
     early = sum(index < 20 for index in chosen)
     late = sum(20 <= index < 40 for index in chosen)
@@ -202,9 +202,9 @@ def test_what_the_sfm_answers_adds_and_retires_keyframes(stage: Callable[..., St
         scene.show(stamp, compressed(stamp, view(wall, 20 * index)))
     chosen = scene.chosen()
     assert len(chosen) >= 5
-    ties = [tie(stamp, 0.95, 500, 500) for stamp in chosen]
-    ties[2] = tie(chosen[2], 0.5, 500, 100)
-    scene.answer(chosen[-1], len(chosen), ties)
+    reports = [report(stamp, 0.95, 500, 500) for stamp in chosen]
+    reports[2] = report(chosen[2], 0.5, 500, 100)
+    scene.answer(chosen[-1], len(chosen), reports)
     scene.spin_until(lambda: len(scene.keyframes) > len(chosen))
     added = scene.chosen()[-1]
     assert chosen[2] < added < chosen[3]
@@ -221,13 +221,13 @@ def test_a_recording_becomes_a_network(stage: Callable[..., Stage], wall: NDArra
     done = [0, 0]
 
     def answer() -> None:
-        ties = [tie(stamp, 0.99 if len(images) > 4 else 0.86, 500, 500) for stamp in sorted(images)]
+        reports = [report(stamp, 0.99 if len(images) > 4 else 0.86, 500, 500) for stamp in sorted(images)]
         scene.publish_answer(
             ImageOverlapArray(
                 header=messages.header(max(images), "camera"),
                 keyframes_considered=done[0],
                 retirements_considered=done[1],
-                images=ties,
+                images=reports,
             )
         )
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced, is_cut_off, reduction
-from pipeprog_frames.frame_buffer import Frame, FrameFile, FrameRing
+from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing
 from pipeprog_frames.selector import Decision, FrameSelector, Load
-from pipeprog_frames.stream import Stream
+from pipeprog_frames.stream import KeyframeStream
 from pipeprog_frames.tracker import Tracker
 
 WIDTH, HEIGHT = 320, 180
@@ -139,7 +139,7 @@ def test_relief_asks_for_fewer_keyframes(wall: NDArray[np.uint8]) -> None:
     counts = []
     for relief in (0.0, 0.5, 1.0):
         selector = FrameSelector(FramesConfig(), CAMERA)
-        selector.relieve(relief)
+        selector.relax(relief)
         counts.append(sum(decision.chosen for decision in run(selector, images)))
     assert counts[0] > counts[1] > counts[2] > 3
 
@@ -220,13 +220,13 @@ def test_a_long_4k_stream_stays_in_flat_memory(wall: NDArray[np.uint8]) -> None:
     """Ten minutes at 30 Hz, shortened to what fills the ring three times over: 1 MiB a frame."""
     camera = Camera(3840, 2160, 2700.0, 2700.0, 1919.5, 1079.5)
     ring = FrameRing(64 << 20)
-    stream = Stream(FramesConfig(), camera, ring.middle)
+    stream = KeyframeStream(FramesConfig(), camera, ring.sharpest_between)
     views = [cv2.resize(pan(wall, 2.5 * index), (480, 270)) for index in range(60)]
     peaks = []
     tracemalloc.start()
     for index in range(240):
         stamp = 1 + index * 33_333_333
-        ring.add(Frame(stamp, "camera", bytes(1 << 20), camera))
+        ring.add(EncodedFrame(stamp, "camera", bytes(1 << 20), camera))
         # There and back: a stream that would walk on would need a wall of ten minutes.
         stream.consider(stamp, partial(views.__getitem__, min(index % 120, 119 - index % 120)))
         if index % 60 == 59:
@@ -243,19 +243,19 @@ def test_the_ring_gives_up_its_oldest_and_the_file_none(wall: NDArray[np.uint8])
     ring, file = FrameRing(sum(map(len, encoded[10:]))), FrameFile()
     for store in (ring, file):
         for index, data in enumerate(encoded):
-            store.add(Frame(index + 1, "camera", data, camera))
-        store.add(Frame(1, "camera", b"again", camera))  # a stamp that runs backwards
+            store.add(EncodedFrame(index + 1, "camera", data, camera))
+        store.add(EncodedFrame(1, "camera", b"again", camera))  # a stamp that runs backwards
         kept = store.get(20)
         assert kept is not None
         assert kept.encoded == encoded[19]
-        assert store.middle(12, 20) in (15, 16, 17)
-        assert store.middle(15, 17, {16}) is None
+        assert store.sharpest_between(12, 20) in (15, 16, 17)
+        assert store.sharpest_between(15, 17, {16}) is None
     assert ring.get(5) is None
     first = file.get(1)
     assert first is not None
     assert first.encoded == encoded[0]
-    assert file.middle(1, 9) in (4, 5, 6)
-    assert ring.middle(1, 9) is None
+    assert file.sharpest_between(1, 9) in (4, 5, 6)
+    assert ring.sharpest_between(1, 9) is None
 
 
 @given(sizes=st.lists(st.integers(1, 60), min_size=1, max_size=60), capacity=st.integers(1, 100))
@@ -264,7 +264,7 @@ def test_the_ring_holds_the_last_frames_unchanged(sizes: list[int], capacity: in
     camera = Camera(WIDTH, HEIGHT, 225.0, 225.0, 159.5, 89.5)
     encoded = {stamp: bytes([stamp]) * size for stamp, size in enumerate(sizes)}
     for stamp, data in encoded.items():
-        ring.add(Frame(stamp, "camera", data, camera))
+        ring.add(EncodedFrame(stamp, "camera", data, camera))
     held = {stamp: frame.encoded for stamp in encoded if (frame := ring.get(stamp)) is not None}
     assert held == {stamp: encoded[stamp] for stamp in held}
     assert list(held) == list(encoded)[-len(held) :]
@@ -280,8 +280,8 @@ def test_the_sharpest_about_the_middle_is_taken_and_a_useless_frame_never(wall: 
     images = [pan(wall, 3 * index) for index in range(9)]
     images[3], images[4] = cv2.GaussianBlur(images[3], (0, 0), 3), np.full((HEIGHT, WIDTH), 3, np.uint8)
     for index, image in enumerate(images):
-        ring.add(Frame(index, "camera", cv2.imencode(".jpg", image)[1].tobytes(), camera))
-    assert ring.middle(0, 8) in (2, 5)
+        ring.add(EncodedFrame(index, "camera", cv2.imencode(".jpg", image)[1].tobytes(), camera))
+    assert ring.sharpest_between(0, 8) in (2, 5)
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])

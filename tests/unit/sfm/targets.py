@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.conic import project_circles
-from pipeprog_sfm.boards.ellipses import TargetEllipses
+from pipeprog_sfm.boards.ellipses import ImageEllipses
 
 CAMERA = Camera(640, 400, 500.0, 500.0, 319.5, 199.5)
 PLANE = np.array([[-240, 150], [240, 150], [0, 0], [-240, -150], [240, -150]]) / 1000
@@ -31,7 +31,7 @@ def camera_from_board(place: tuple[float, float, float], target: tuple[float, fl
     return pose
 
 
-def exact_ellipses(boards, poses, camera=CAMERA, noise=0.0, rng=None) -> TargetEllipses:
+def exact_ellipses(boards, poses, camera=CAMERA, noise=0.0, rng=None) -> ImageEllipses:
     """The images of boards, one pose each, without rendering; only circles that are wholly in the image."""
     parts = [
         project_circles(camera.matrix, pose, b.centres, b.circle_radius) for b, pose in zip(boards, poses, strict=True)
@@ -41,7 +41,7 @@ def exact_ellipses(boards, poses, camera=CAMERA, noise=0.0, rng=None) -> TargetE
     inside = ((centres > reach) & (centres < np.array([camera.width, camera.height]) - reach)).all(1)
     if rng is not None:
         centres = centres + rng.normal(0.0, noise, centres.shape)
-    return TargetEllipses(centres[inside], shapes[inside], np.full(inside.sum(), max(noise, 0.01) * np.sqrt(32)))
+    return ImageEllipses(centres[inside], shapes[inside], np.full(inside.sum(), max(noise, 0.01) * np.sqrt(32)))
 
 
 def render(board: Board, pose: np.ndarray, camera: Camera = CAMERA, seed: int = 0) -> np.ndarray:

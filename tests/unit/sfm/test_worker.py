@@ -8,7 +8,7 @@ import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm import worker
-from pipeprog_sfm.boards.board_file import Targets
+from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -17,7 +17,7 @@ CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 class Prompt:
     """Stands for a Reconstruction whose maps are there as soon as they are asked for."""
 
-    def __init__(self, config: SfmConfig, targets: Targets) -> None:
+    def __init__(self, config: SfmConfig, board_file: BoardFile) -> None:
         self.is_mapping = False
 
     def add(self, *keyframe: object) -> None:
@@ -58,7 +58,7 @@ def serving(monkeypatch):
 
     def run() -> None:
         with pytest.raises(EOFError):
-            worker.serve(theirs, SfmConfig(), Targets(), ())
+            worker.serve(theirs, SfmConfig(), BoardFile(), ())
 
     thread = threading.Thread(target=run)
     thread.start()

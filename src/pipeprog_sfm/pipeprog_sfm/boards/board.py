@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 
-LEAST_CIRCLES = 3  # circles that identify a board: fewer agree by chance
-SAME_PLACE = 0.1  # of a circle's radius: circles of two layouts closer than that are the same circle
+MIN_CIRCLES = 3  # circles that identify a board: fewer agree by chance
+LAYOUT_TOLERANCE = 0.1  # of a circle's radius: circles of two layouts closer than that are the same circle
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def symmetries(board: Board) -> NDArray[np.intp]:
 
     Mirrored orders are no symmetry: a board is seen from its front.
     """
-    return _turns_onto(board, board)
+    return _orders_onto(board, board)
 
 
 def layouts(boards: Sequence[Board]) -> list[list[Board]]:
@@ -70,7 +70,7 @@ def layouts(boards: Sequence[Board]) -> list[list[Board]]:
     groups: list[list[Board]] = []
     for board in boards:
         for group in groups:
-            if len(_turns_onto(group[0], board)):
+            if len(_orders_onto(group[0], board)):
                 group.append(board)
                 break
         else:
@@ -78,11 +78,14 @@ def layouts(boards: Sequence[Board]) -> list[list[Board]]:
     return groups
 
 
-def _turns_onto(board: Board, other: Board) -> NDArray[np.intp]:
+def _orders_onto(board: Board, other: Board) -> NDArray[np.intp]:
     """(S, N) orders `o` so that other.centres[o] is board.centres turned in the plane and shifted."""
     orders: list[NDArray[np.intp]] = []
-    if len(board.centres) == len(other.centres) and abs(board.circle_radius / other.circle_radius - 1) < SAME_PLACE:
-        limit = SAME_PLACE * board.circle_radius
+    if (
+        len(board.centres) == len(other.centres)
+        and abs(board.circle_radius / other.circle_radius - 1) < LAYOUT_TOLERANCE
+    ):
+        limit = LAYOUT_TOLERANCE * board.circle_radius
         plane, target = (one.centres[:, :2] - one.centres[:, :2].mean(0) for one in (board, other))
         points, goals = (xy[:, 0] + 1j * xy[:, 1] for xy in (plane, target))
         anchor = np.abs(points).argmax()

@@ -18,13 +18,13 @@ from pipeprog_sfm.boards.board_covariance import (
     image_noise,
     variance_components,
 )
-from pipeprog_sfm.boards.placed_board import BoardView, PlacedBoard, Rows, circle_pixels, image_rows, project
+from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, circle_pixels, image_rows, project_rows
 from pipeprog_sfm.boards.triangulation import cross_matrices
 from pipeprog_sfm.config import BoardConfig
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class PlacementSensitivity:
     """What a placement inherits.
 
     Attributes:
@@ -36,7 +36,7 @@ class Sensitivity:
     derivatives: Mapping[int, FloatArray]
 
 
-def adjusted(
+def adjust_board(
     board: Board,
     views: Sequence[BoardView],
     start: FloatArray,
@@ -60,7 +60,7 @@ def adjusted(
             root = np.sqrt(cauchy_weights(white))[:, None]
             flat, target = (white_jacobian * root[..., None]).reshape(-1, 7), (white * root).ravel()
             change = np.linalg.lstsq(flat, -target, rcond=None)[0]
-            placement = _turned(placement, change, board)
+            placement = _changed(placement, change, board)
             if np.abs(change).max() < 1e-10:
                 break
         sigma = float(np.sqrt(np.linalg.pinv(flat.T @ flat)[6, 6]))
@@ -69,16 +69,16 @@ def adjusted(
     return PlacedBoard(board, tuple(views), placement, sigma, *components)
 
 
-def sensitivity(
+def placement_sensitivity(
     place: PlacedBoard, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig
-) -> Sensitivity:
+) -> PlacementSensitivity:
     """How a placement errs with its images and with the poses, at the minimum of its weighted squares."""
-    rows = image_rows(place.views, poses, circle_pixels(place.views, place.placement, poses, camera, config))
-    residuals, jacobian = _similarity_rows(rows, place.placement, place.board, camera)
+    rows = image_rows(place.views, poses, circle_pixels(place.views, place.model_from_board, poses, camera, config))
+    residuals, jacobian = _similarity_rows(rows, place.model_from_board, place.board, camera)
     noise = image_noise(jacobian[:, :, 3:6], rows.groups, place.centre_sigma, place.pose_sigma)
     root = np.sqrt(cauchy_weights(noise.whitened(residuals[..., None])[..., 0]))[:, None, None]
-    points = (place.board.centres @ place.placement[:3, :3].T + place.placement[:3, 3])[rows.circles]
-    by_shift = project(rows, points, camera)[1] @ rows.rotations.transpose(0, 2, 1)
+    points = (place.board.centres @ place.model_from_board[:3, :3].T + place.model_from_board[:3, 3])[rows.circles]
+    by_shift = project_rows(rows, points, camera)[1] @ rows.rotations.transpose(0, 2, 1)
     by_turn = by_shift @ -cross_matrices(np.einsum("nij,nj->ni", rows.rotations, points))
     white = noise.whitened(jacobian) * root
     by_pose = noise.whitened(np.concatenate([by_turn, by_shift], axis=-1)) * root
@@ -88,19 +88,21 @@ def sensitivity(
     np.add.at(products, rows.groups, white.transpose(0, 2, 1) @ by_pose)
     derivatives = -covariance @ products
     stamps = [view.stamp for view in place.views]
-    return Sensitivity(covariance, dict(zip(stamps, derivatives, strict=True)))
+    return PlacementSensitivity(covariance, dict(zip(stamps, derivatives, strict=True)))
 
 
-def _similarity_rows(rows: Rows, placement: FloatArray, board: Board, camera: Camera) -> tuple[FloatArray, FloatArray]:
+def _similarity_rows(
+    rows: CircleRows, placement: FloatArray, board: Board, camera: Camera
+) -> tuple[FloatArray, FloatArray]:
     """Residuals (M, 2) and derivatives (M, 2, 7) by turn, shift and logarithm of size about the board's middle."""
     middle = placement[:3, :3] @ board.centres.mean(0) + placement[:3, 3]
     arms = (board.centres @ placement[:3, :3].T + placement[:3, 3] - middle)[rows.circles]
-    pixels, by_point = project(rows, middle + arms, camera)
+    pixels, by_point = project_rows(rows, middle + arms, camera)
     by_size = by_point @ arms[..., None]
     return pixels - rows.pixels, np.concatenate([by_point @ -cross_matrices(arms), by_point, by_size], axis=-1)
 
 
-def _turned(placement: FloatArray, change: FloatArray, board: Board) -> FloatArray:
+def _changed(placement: FloatArray, change: FloatArray, board: Board) -> FloatArray:
     """The placement changed by the seven parameters of `_similarity_rows`."""
     centre = board.centres.mean(0)
     middle = placement[:3, :3] @ centre + placement[:3, 3]

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board_covariance import cauchy_weights
-from pipeprog_sfm.boards.placed_board import PlacedBoard, circle_pixels, image_rows, project
+from pipeprog_sfm.boards.placed_board import PlacedBoard, circle_pixels, image_rows, project_rows
 from pipeprog_sfm.config import BoardConfig
 
 CONTRADICTION = 1e-4  # probability with which a sound board is taken for one that contradicts its file
@@ -47,19 +47,19 @@ class BoardPlacement:
 def measure(place: PlacedBoard, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig) -> BoardPlacement:
     """Every circle triangulated on its own, and what it says against the file."""
     board, scale = place.board, place.scale
-    rows = image_rows(place.views, poses, circle_pixels(place.views, place.placement, poses, camera, config))
+    rows = image_rows(place.views, poses, circle_pixels(place.views, place.model_from_board, poses, camera, config))
     residuals = np.full((len(board.centres), 3), np.nan)
     sigmas, pixels = residuals.copy(), residuals[:, 0].copy()
     noise = np.hypot(place.centre_sigma, place.pose_sigma)
-    to_metres = place.placement[:3, :3].T * scale**2  # its transpose is the rotation over the scale
+    to_metres = place.model_from_board[:3, :3].T * scale**2  # its transpose is the rotation over the scale
     points = np.full((len(board.centres), 3), np.nan)
     for circle in range(len(board.centres)):
         own = rows.take(rows.circles == circle)
         if len(own.pixels) < 2:
             continue
-        point = place.placement[:3, :3] @ board.centres[circle] + place.placement[:3, 3]
+        point = place.model_from_board[:3, :3] @ board.centres[circle] + place.model_from_board[:3, 3]
         for _ in range(10):
-            projected, jacobian = project(own, np.broadcast_to(point, (len(own.pixels), 3)), camera)
+            projected, jacobian = project_rows(own, np.broadcast_to(point, (len(own.pixels), 3)), camera)
             error = (projected - own.pixels) / noise
             weights = np.sqrt(cauchy_weights(error))[:, None]
             flat = (jacobian / noise * weights[..., None]).reshape(-1, 3)
@@ -67,7 +67,7 @@ def measure(place: PlacedBoard, poses: Mapping[int, FloatArray], camera: Camera,
             point = point + change
         covariance = np.linalg.pinv(flat.T @ flat)
         points[circle] = point
-        residuals[circle] = to_metres @ (point - place.placement[:3, 3]) - board.centres[circle]
+        residuals[circle] = to_metres @ (point - place.model_from_board[:3, 3]) - board.centres[circle]
         sigmas[circle] = np.sqrt(np.diag(to_metres @ covariance @ to_metres.T))
         pixels[circle] = np.sqrt(np.mean(((projected - own.pixels) ** 2).sum(1)))
     known = ~np.isnan(residuals[:, 0])
@@ -77,7 +77,7 @@ def measure(place: PlacedBoard, poses: Mapping[int, FloatArray], camera: Camera,
         scale,
         place.sigma,
         float(spreads[0] / spreads[1]),
-        place.placement,
+        place.model_from_board,
         tuple(view.stamp for view in place.views),
         residuals,
         sigmas,

@@ -12,17 +12,17 @@ from scipy.spatial import cKDTree
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.boards.board import LEAST_CIRCLES, Board, BoardObservation, layouts, symmetries
-from pipeprog_sfm.boards.board_pose import BoardFit, misfit, refined, three_point_poses
+from pipeprog_sfm.boards.board import MIN_CIRCLES, Board, BoardObservation, layouts, symmetries
+from pipeprog_sfm.boards.board_pose import BoardFit, misfit, refine_pose, three_point_poses
 from pipeprog_sfm.boards.conic import circle_centre_images, circles_from_conics, project_circles
-from pipeprog_sfm.boards.ellipses import PROFILES, TargetEllipses
+from pipeprog_sfm.boards.ellipses import PROFILES, ImageEllipses
 
 MAX_CANDIDATES = 400  # ellipses considered in one image: a perforated sheet must not stall the search
 MAX_HYPOTHESES = 20000  # poses from pairs of ellipses, likewise
 MAX_TRIALS = 200  # hypotheses looked at closely for one layout in one image
 
 
-def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) -> list[BoardObservation]:
+def detect_boards(ellipses: ImageEllipses, boards: Sequence[Board], camera: Camera) -> list[BoardObservation]:
     """Boards of which at least three circles are in the image, known by their own geometry.
 
     Each ellipse and a circle radius give a place and a normal in space; two of them whose distance and plane fit two
@@ -63,8 +63,8 @@ def identify(ellipses: TargetEllipses, boards: Sequence[Board], camera: Camera) 
     return found
 
 
-def identify_predicted(
-    ellipses: TargetEllipses, board: Board, camera: Camera, camera_from_board: FloatArray
+def detect_predicted_board(
+    ellipses: ImageEllipses, board: Board, camera: Camera, camera_from_board: FloatArray
 ) -> BoardObservation | None:
     """Circles of a board whose pose is known already, or None where none of them is among the ellipses.
 
@@ -82,11 +82,11 @@ def identify_predicted(
     faces_camera = camera_from_board[:3, 2] @ camera_from_board[:3, 3] < 0
     if not faces_camera or depths.min() <= board.circle_radius or not len(ellipses):
         return None
-    fit = _explained(ellipses, np.ones(len(ellipses), bool), board, camera.matrix, camera_from_board, 0.5)
+    fit = _matched_circles(ellipses, np.ones(len(ellipses), bool), board, camera.matrix, camera_from_board, 0.5)
     return _observation(ellipses, board, camera.matrix, fit) if len(fit.circles) else None
 
 
-def _observation(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> BoardObservation:
+def _observation(ellipses: ImageEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> BoardObservation:
     order = np.argsort(fit.circles)
     circles, members = fit.circles[order], fit.members[order]
     conics = ellipses.conics[members]
@@ -97,11 +97,11 @@ def _observation(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit
 
 
 def _hypotheses(
-    ellipses: TargetEllipses, free: NDArray[np.bool_], board: Board, matrix: FloatArray
+    ellipses: ImageEllipses, free: NDArray[np.bool_], board: Board, matrix: FloatArray
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """Circles of the board and the ellipses that a pose from a pair of ellipses explains them by; the best first."""
     members = np.flatnonzero(free)
-    if len(members) < LEAST_CIRCLES:
+    if len(members) < MIN_CIRCLES:
         return
     places, normals = circles_from_conics(ellipses.conics[members], matrix, board.circle_radius)
     owners = np.repeat(members, 2)
@@ -144,7 +144,7 @@ def _hypotheses(
     scores = matched.sum(1) - 0.5 * np.where(matched, gaps / gate, 0.0).sum(1) / np.maximum(matched.sum(1), 1)
     seen: set[bytes] = set()
     for index in np.argsort(-scores, kind="stable"):
-        if matched[index].sum() < LEAST_CIRCLES:
+        if matched[index].sum() < MIN_CIRCLES:
             return
         circles = np.flatnonzero(matched[index])
         chosen = members[nearest[index, circles]]
@@ -155,7 +155,7 @@ def _hypotheses(
 
 
 def _verify(
-    ellipses: TargetEllipses,
+    ellipses: ImageEllipses,
     free: NDArray[np.bool_],
     board: Board,
     camera: Camera,
@@ -176,14 +176,14 @@ def _verify(
     misfits = [misfit(ellipses, board, matrix, fit)[triple].max() for fit in fits]
     if not misfits or min(misfits) > 4.0:
         return None
-    fit = _explained(ellipses, free, board, matrix, starts[int(np.argmin(misfits))], 0.25)
-    while len(fit.circles) >= LEAST_CIRCLES:
-        fit = refined(ellipses, board, matrix, fit)
+    fit = _matched_circles(ellipses, free, board, matrix, starts[int(np.argmin(misfits))], 0.25)
+    while len(fit.circles) >= MIN_CIRCLES:
+        fit = refine_pose(ellipses, board, matrix, fit)
         off = misfit(ellipses, board, matrix, fit)
         if off.max() <= 1.0:
             break
         fit = fit.without(int(off.argmax()))
-    if len(fit.circles) < LEAST_CIRCLES:
+    if len(fit.circles) < MIN_CIRCLES:
         return None
     # Circles that the image should show as well but does not: some may be hidden, not most of them.
     centres, shapes = project_circles(matrix, fit.pose, board.centres, board.circle_radius)
@@ -198,8 +198,8 @@ def _area(corners: FloatArray) -> float:
     return 0.5 * abs(float(ax * by - ay * bx))
 
 
-def _explained(
-    ellipses: TargetEllipses,
+def _matched_circles(
+    ellipses: ImageEllipses,
     free: NDArray[np.bool_],
     board: Board,
     matrix: FloatArray,

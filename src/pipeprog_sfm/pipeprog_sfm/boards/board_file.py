@@ -12,11 +12,11 @@ import numpy as np
 import yaml
 
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.boards.board import LEAST_CIRCLES, Board, symmetries
+from pipeprog_sfm.boards.board import MIN_CIRCLES, Board, symmetries
 
 
 @dataclass(frozen=True)
-class Distance:
+class KnownDistance:
     """A measured distance between the centres of two circles.
 
     Attributes:
@@ -33,7 +33,7 @@ class Distance:
 
 
 @dataclass(frozen=True)
-class MarkPair:
+class ScaleBar:
     """Two discs of one size.
 
     Attributes:
@@ -49,10 +49,10 @@ class MarkPair:
     sigma: float
 
     @property
-    def distance(self) -> Distance:
+    def distance(self) -> KnownDistance:
         """Between the circles of `discs`."""
         one, two = self.discs
-        return Distance(self.name, ((one.name, 0), (two.name, 0)), self.length, self.sigma)
+        return KnownDistance(self.name, ((one.name, 0), (two.name, 0)), self.length, self.sigma)
 
     @property
     def discs(self) -> tuple[Board, Board]:
@@ -62,21 +62,21 @@ class MarkPair:
 
 
 @dataclass(frozen=True)
-class Targets:
+class BoardFile:
     """Everything with a known size.
 
     Attributes:
         boards: flat boards with circles.
         distances: measured between circles of boards.
-        marks: pairs of single discs.
+        scale_bars: pairs of single discs.
     """
 
     boards: Sequence[Board] = ()
-    distances: Sequence[Distance] = ()
-    marks: Sequence[MarkPair] = ()
+    distances: Sequence[KnownDistance] = ()
+    scale_bars: Sequence[ScaleBar] = ()
 
 
-def load_targets(path: str | Path) -> Targets:
+def load_board_file(path: str | Path) -> BoardFile:
     """What a BOARD.yaml file says; at least one board or pair of marks.
 
     boards: [{name, circle_radius_mm, centres_mm: [[x, y], ...]}]
@@ -104,10 +104,10 @@ def load_targets(path: str | Path) -> Targets:
         boards.append(board)
     distances = [_distance(entry, f"{path}: distance {k}", boards) for k, entry in enumerate(entries["distances"], 1)]
     marks = [_marks(entry, f"{path}: marks {k}", f"marks {k}") for k, entry in enumerate(entries["marks"], 1)]
-    return Targets(tuple(boards), tuple(distances), tuple(marks))
+    return BoardFile(tuple(boards), tuple(distances), tuple(marks))
 
 
-def _distance(value: Any, where: str, boards: Sequence[Board]) -> Distance:
+def _distance(value: Any, where: str, boards: Sequence[Board]) -> KnownDistance:
     entry = _entry(value, ("from", "to", "distance_mm", "sigma_mm"), where)
     ends = []
     if not boards:
@@ -124,16 +124,16 @@ def _distance(value: Any, where: str, boards: Sequence[Board]) -> Distance:
     if ends[0] == ends[1]:
         raise InputError(f"{where}: both ends are {entry['from']}")
     length, sigma = _length(entry, where)
-    return Distance(f"{entry['from']} to {entry['to']}", (ends[0], ends[1]), length, sigma)
+    return KnownDistance(f"{entry['from']} to {entry['to']}", (ends[0], ends[1]), length, sigma)
 
 
-def _marks(value: Any, where: str, name: str) -> MarkPair:
+def _marks(value: Any, where: str, name: str) -> ScaleBar:
     entry = _entry(value, ("circle_radius_mm", "distance_mm", "sigma_mm"), where)
     radius = _circle_radius(entry, where)
     length, sigma = _length(entry, where)
     if length <= 2 * radius:
         raise InputError(f"{where}: distance_mm = {1000 * length:g} is within the marks: measure between centres")
-    return MarkPair(name, radius, length, sigma)
+    return ScaleBar(name, radius, length, sigma)
 
 
 def _length(entry: Mapping[str, Any], where: str) -> tuple[float, float]:
@@ -185,8 +185,8 @@ def _board(value: Any, where: str) -> Board:
     rows = entry["centres_mm"]
     if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 2 for row in rows):
         raise InputError(f"{where}: centres_mm must be a list of [x, y] pairs in millimetres")
-    if len(rows) < LEAST_CIRCLES:
-        raise InputError(f"{where}: {len(rows)} circles, but a board needs {LEAST_CIRCLES} or more")
+    if len(rows) < MIN_CIRCLES:
+        raise InputError(f"{where}: {len(rows)} circles, but a board needs {MIN_CIRCLES} or more")
     flat = np.array([[_number(number, f"{where}: centres_mm") for number in row] for row in rows])
     apart = np.linalg.norm(flat[:, None] - flat[None], axis=-1) + np.diag(np.full(len(flat), np.inf))
     if apart.min() <= 2 * radius:

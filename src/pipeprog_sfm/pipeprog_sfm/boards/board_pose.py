@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.conic import project_circles
-from pipeprog_sfm.boards.ellipses import TargetEllipses
+from pipeprog_sfm.boards.ellipses import ImageEllipses
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def three_point_poses(points: FloatArray, pixels: FloatArray, matrix: FloatArray
     return poses
 
 
-def misfit(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> FloatArray:
+def misfit(ellipses: ImageEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> FloatArray:
     """(K,) how far its ellipses are from what the pose predicts; up to 1 is agreement.
 
     Allowed are, for a centre, half a pixel or 3 % of the radius (lens, print), and for the outline one pixel or 5 %
@@ -56,7 +56,7 @@ def misfit(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: Boar
     return np.maximum(gaps, bends / np.maximum(0.05 * radii, 1.0))
 
 
-def refined(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> BoardFit:
+def refine_pose(ellipses: ImageEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> BoardFit:
     """The same with the pose that fits the ellipses best (damped Gauss-Newton).
 
     Residuals are the centres, to 0.1 px, and the shapes, to 0.5 px: the size of a disc suffers from exposure.
@@ -75,11 +75,13 @@ def refined(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: Boa
     current = residuals(pose)
     damping = 1e-3
     for _ in range(20):
-        jacobian = np.stack([(residuals(_moved(pose, step)) - current) / step.sum() for step in np.diag(steps)], axis=1)
+        jacobian = np.stack(
+            [(residuals(_changed(pose, step)) - current) / step.sum() for step in np.diag(steps)], axis=1
+        )
         normal = jacobian.T @ jacobian
         gradient = jacobian.T @ current
         change = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -gradient)
-        candidate = _moved(pose, change)
+        candidate = _changed(pose, change)
         trial = residuals(candidate)
         if trial @ trial < current @ current and candidate[2, 3] > board.circle_radius:
             gain = 1.0 - (trial @ trial) / (current @ current)
@@ -93,7 +95,7 @@ def refined(ellipses: TargetEllipses, board: Board, matrix: FloatArray, fit: Boa
     return replace(fit, pose=pose)
 
 
-def _moved(pose: FloatArray, change: FloatArray) -> FloatArray:
+def _changed(pose: FloatArray, change: FloatArray) -> FloatArray:
     """The pose turned by the rotation vector change[:3] about the board's origin and shifted by change[3:]."""
     moved = pose.copy()
     moved[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ pose[:3, :3]

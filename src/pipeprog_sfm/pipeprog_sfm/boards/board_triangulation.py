@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board, BoardObservation, layouts, symmetries
-from pipeprog_sfm.boards.board_adjustment import adjusted
+from pipeprog_sfm.boards.board_adjustment import adjust_board
 from pipeprog_sfm.boards.board_covariance import PRIOR_CENTRE, PRIOR_POSE
-from pipeprog_sfm.boards.board_detection import identify_predicted
-from pipeprog_sfm.boards.ellipses import TargetEllipses
-from pipeprog_sfm.boards.placed_board import BoardView, PlacedBoard, Rows, image_rows, project
-from pipeprog_sfm.boards.triangulation import LEAST_SINE, midpoints, similarity
+from pipeprog_sfm.boards.board_detection import detect_predicted_board
+from pipeprog_sfm.boards.ellipses import ImageEllipses
+from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, image_rows, project_rows
+from pipeprog_sfm.boards.triangulation import MIN_SINE, midpoints, similarity
 from pipeprog_sfm.config import BoardConfig
 
-PARTNERS = 6  # images that each image is paired with, near to far, to place a board
-LARGEST_SIGMA = 0.01  # relative; a scale known worse than that is not published
+PARTNER_IMAGES = 6  # images that each image is paired with, near to far, to place a board
+MAX_SIGMA = 0.01  # relative; a scale known worse than that is not published
 
 
 def place_boards(
@@ -34,7 +34,7 @@ def place_boards(
     camera: Camera,
     boards: Sequence[Board],
     config: BoardConfig,
-    ellipses: Mapping[int, TargetEllipses] | None,
+    ellipses: Mapping[int, ImageEllipses] | None,
 ) -> list[PlacedBoard]:
     """Every board at every place where images of known pose agree on it, in the order in which they were seen.
 
@@ -58,13 +58,15 @@ def place_circle(
     poses: Mapping[int, FloatArray],
     camera: Camera,
     config: BoardConfig,
-    ellipses: Mapping[int, TargetEllipses],
+    ellipses: Mapping[int, ImageEllipses],
 ) -> PlacedBoard:
     """A board of one circle, of which a place is known already, adjusted on every image that shows it.
 
     One circle fixes neither the turn in its plane nor the size of the model: these stay as `start` (4, 4) has them.
     """
-    return _completed(PlacedBoard(board, (), start, 0.0, PRIOR_CENTRE, PRIOR_POSE), poses, camera, config, ellipses)
+    return _adjusted_on_all(
+        PlacedBoard(board, (), start, 0.0, PRIOR_CENTRE, PRIOR_POSE), poses, camera, config, ellipses
+    )
 
 
 def _places(
@@ -73,7 +75,7 @@ def _places(
     camera: Camera,
     board: Board,
     config: BoardConfig,
-    ellipses: Mapping[int, TargetEllipses] | None,
+    ellipses: Mapping[int, ImageEllipses] | None,
 ) -> list[PlacedBoard]:
     """Places of one layout in the model, each adjusted."""
     places: list[PlacedBoard] = []
@@ -83,32 +85,32 @@ def _places(
         if len(members) < (3 if places else 2):
             break
         chosen = [views[index] for index in members]
-        place = adjusted(board, chosen, start, poses, camera, config)
+        place = adjust_board(board, chosen, start, poses, camera, config)
         if ellipses is not None:
-            place = _completed(place, poses, camera, config, ellipses)
+            place = _adjusted_on_all(place, poses, camera, config, ellipses)
         taken = {(view.stamp, *centre) for view in place.views for centre in view.seen.ellipse_centres}
         left = [view for index, view in enumerate(views) if index not in members]
         views = [view for view in left if not any((view.stamp, *xy) in taken for xy in view.seen.ellipse_centres)]
-        if place.sigma <= LARGEST_SIGMA and (not places or abs(place.scale / places[0].scale - 1) < 0.05):
+        if place.sigma <= MAX_SIGMA and (not places or abs(place.scale / places[0].scale - 1) < 0.05):
             places.append(place)
     return places
 
 
-def _completed(
+def _adjusted_on_all(
     place: PlacedBoard,
     poses: Mapping[int, FloatArray],
     camera: Camera,
     config: BoardConfig,
-    ellipses: Mapping[int, TargetEllipses],
+    ellipses: Mapping[int, ImageEllipses],
 ) -> PlacedBoard:
     """The place adjusted on every image in which a circle of the board is where it must be."""
     views = []
     for stamp in sorted(stamp for stamp in ellipses if stamp in poses):
-        camera_from_board = _metric(poses[stamp] @ place.placement, place.scale)
-        found = identify_predicted(ellipses[stamp], place.board, camera, camera_from_board)
+        camera_from_board = _metric(poses[stamp] @ place.model_from_board, place.scale)
+        found = detect_predicted_board(ellipses[stamp], place.board, camera, camera_from_board)
         if found is not None:
             views.append(BoardView(stamp, found))
-    return adjusted(place.board, views, place.placement, poses, camera, config) if len(views) >= 2 else place
+    return adjust_board(place.board, views, place.model_from_board, poses, camera, config) if len(views) >= 2 else place
 
 
 def _metric(camera_from_board: FloatArray, scale: float) -> FloatArray:
@@ -134,7 +136,7 @@ def _consensus(
     for first in np.unique(np.linspace(0, len(views) - 1, 40).astype(int)):
         # The far ones triangulate best, but may see an equal board elsewhere: the near ones see the same.
         by_distance = np.argsort(np.linalg.norm(centres - centres[first], axis=1), kind="stable")[1:]
-        partners = by_distance[np.unique(np.linspace(0, len(by_distance) - 1, PARTNERS).astype(int))]
+        partners = by_distance[np.unique(np.linspace(0, len(by_distance) - 1, PARTNER_IMAGES).astype(int))]
         for partner, order in product(partners.tolist(), orders):
             start = _from_pair(rows, int(first), partner, order, camera, board)
             if start is None:
@@ -163,7 +165,7 @@ def _all_in_group(good: NDArray[np.bool_], groups: NDArray[np.intp], count: int)
 
 
 def _from_pair(
-    rows: Rows, first: int, second: int, order: NDArray[np.intp], camera: Camera, board: Board
+    rows: CircleRows, first: int, second: int, order: NDArray[np.intp], camera: Camera, board: Board
 ) -> FloatArray | None:
     """model_from_board from the circles that two images share, or None where they do not give it."""
     one, two = rows.take(rows.groups == first), rows.take(rows.groups == second)
@@ -178,11 +180,13 @@ def _from_pair(
         rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
         origins.append(-np.einsum("nji,nj->ni", rotations, part.translations[chosen]))
     points, depths, sines = midpoints(origins[0], rays[0], origins[1], rays[1])
-    if sines.min() < LEAST_SINE or depths.min() <= 0:
+    if sines.min() < MIN_SINE or depths.min() <= 0:
         return None
     return similarity(board.centres[common], points)
 
 
-def _errors(rows: Rows, placement: FloatArray, board: Board, camera: Camera, circles: NDArray[np.intp]) -> FloatArray:
+def _errors(
+    rows: CircleRows, placement: FloatArray, board: Board, camera: Camera, circles: NDArray[np.intp]
+) -> FloatArray:
     points = board.centres[circles] @ placement[:3, :3].T + placement[:3, 3]
-    return np.linalg.norm(project(rows, points, camera)[0] - rows.pixels, axis=1)
+    return np.linalg.norm(project_rows(rows, points, camera)[0] - rows.pixels, axis=1)

@@ -20,7 +20,7 @@ STEP = 0.5  # px between the samples of an edge profile
 
 
 @dataclass(frozen=True)
-class TargetEllipses:
+class ImageEllipses:
     """Ellipses of one image, in the pixels of the ideal pinhole camera (lens distortion removed).
 
     Attributes:
@@ -47,7 +47,7 @@ class TargetEllipses:
         return axes_and_angle(self.shapes)[0]
 
 
-def find_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig) -> TargetEllipses:
+def detect_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig) -> ImageEllipses:
     """Bright elliptic discs on dark ground.
 
     Contours of the locally thresholded image give candidates; the edge of each is then measured along the normals of
@@ -71,7 +71,7 @@ def find_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig) 
         good &= _plausible(shapes, config)
         centres, shapes, rms = centres[good], shapes[good], rms[good]
     single = _first_of_each(centres, shapes, rms)
-    return TargetEllipses(centres[single], shapes[single], rms[single])
+    return ImageEllipses(centres[single], shapes[single], rms[single])
 
 
 def _candidates(gray: NDArray[np.uint8], config: BoardConfig) -> FloatArray:

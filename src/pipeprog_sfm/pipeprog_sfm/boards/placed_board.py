@@ -30,7 +30,7 @@ class PlacedBoard:
     Attributes:
         board: the board.
         views: images of it.
-        placement: (4, 4) model_from_board, a similarity.
+        model_from_board: (4, 4) similarity, metres on the board to model units.
         sigma: relative standard deviation of `scale`, from the scatter of the images.
         centre_sigma: standard deviation of a circle's centre, px.
         pose_sigma: what the poses add to that from image to image, px at the board.
@@ -38,7 +38,7 @@ class PlacedBoard:
 
     board: Board
     views: tuple[BoardView, ...]
-    placement: FloatArray
+    model_from_board: FloatArray
     sigma: float
     centre_sigma: float
     pose_sigma: float
@@ -46,17 +46,17 @@ class PlacedBoard:
     @property
     def scale(self) -> float:
         """Metres per model unit."""
-        return 1.0 / float(np.cbrt(np.linalg.det(self.placement[:3, :3])))
+        return 1.0 / float(np.cbrt(np.linalg.det(self.model_from_board[:3, :3])))
 
-    def turned(self) -> PlacedBoard:
+    def upside_down(self) -> PlacedBoard:
         """The same, turned by 180 degrees in the board's plane about the middle of its circles."""
         turn = np.diag([-1.0, -1.0, 1.0, 1.0])
         turn[:3, 3] = 2 * self.board.centres.mean(0)
-        return replace(self, placement=self.placement @ turn)
+        return replace(self, model_from_board=self.model_from_board @ turn)
 
 
 @dataclass(frozen=True)
-class Rows:
+class CircleRows:
     """One row for each circle in each image: pixels, what made them, and the image's camera."""
 
     pixels: FloatArray  # (M, 2)
@@ -65,17 +65,17 @@ class Rows:
     rotations: FloatArray  # (M, 3, 3)
     translations: FloatArray  # (M, 3)
 
-    def take(self, chosen: NDArray[np.bool_]) -> Rows:
+    def take(self, chosen: NDArray[np.bool_]) -> CircleRows:
         """The rows of a mask (M,)."""
-        return Rows(*(value[chosen] for value in vars(self).values()))
+        return CircleRows(*(value[chosen] for value in vars(self).values()))
 
 
-def image_rows(views: Sequence[BoardView], poses: Mapping[int, FloatArray], pixels: Sequence[FloatArray]) -> Rows:
+def image_rows(views: Sequence[BoardView], poses: Mapping[int, FloatArray], pixels: Sequence[FloatArray]) -> CircleRows:
     """Rows of all views; poses (4, 4) camera_from_model by stamp; pixels (K, 2) of the circles of each view."""
     groups = np.concatenate([np.full(len(view.seen.indices), index) for index, view in enumerate(views)])
     stack = np.array([poses[view.stamp] for view in views])[groups]
     circles = np.concatenate([view.seen.indices for view in views])
-    return Rows(np.concatenate(pixels), circles, groups, stack[:, :3, :3], stack[:, :3, 3])
+    return CircleRows(np.concatenate(pixels), circles, groups, stack[:, :3, :3], stack[:, :3, 3])
 
 
 def circle_pixels(
@@ -92,7 +92,7 @@ def circle_pixels(
     return [circle_centre_images(view.seen.conics, camera.matrix, poses[view.stamp][:3, :3] @ normal) for view in views]
 
 
-def project(rows: Rows, points: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
+def project_rows(rows: CircleRows, points: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Pixels (M, 2) of model points (M, 3), and derivatives (M, 2, 3) by the points."""
     x, y, z = (np.einsum("nij,nj->ni", rows.rotations, points) + rows.translations).T
     z = np.where(z > 1e-9, z, 1e-9)

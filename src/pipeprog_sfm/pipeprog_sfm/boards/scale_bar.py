@@ -16,28 +16,30 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.boards.board_file import MarkPair
+from pipeprog_sfm.boards.board_file import ScaleBar
 from pipeprog_sfm.boards.board_triangulation import place_circle
 from pipeprog_sfm.boards.conic import circles_from_conics, conic_score
-from pipeprog_sfm.boards.ellipses import TargetEllipses
+from pipeprog_sfm.boards.ellipses import ImageEllipses
 from pipeprog_sfm.boards.placed_board import PlacedBoard
-from pipeprog_sfm.boards.triangulation import LEAST_SINE, midpoints
+from pipeprog_sfm.boards.triangulation import MIN_SINE, midpoints
 from pipeprog_sfm.config import BoardConfig
 
 SAME_CONIC = 0.1  # conic score up to which two ellipses may show one disc, at the poses of a good reconstruction
-EPIPOLAR = 3.0  # px that poses may err by at the disc, or half its small semi-axis, since its centre's image is shifted
+EPIPOLAR_GATE = (
+    3.0  # px that poses may err by at the disc, or half its small semi-axis, since its centre's image is shifted
+)
 SAME_SIZE = 0.1  # of a disc's radius, between views and against the file: exposure makes bright discs larger
-LEAST_VIEWS = 3  # two ellipses agree on a disc by chance, a third one does not
-FIRSTS, PARTNERS = 20, 4  # images that start a match, and images near to far that each is paired with
+MIN_VIEWS = 3  # two ellipses agree on a disc by chance, a third one does not
+START_IMAGES, PARTNER_IMAGES = 20, 4  # images that start a match, and images near to far that each is paired with
 
 
-class MarksError(Exception):
+class ScaleBarError(Exception):
     """The marks tell no scale; the text says why."""
 
 
-def find_marks(
-    pair: MarkPair,
-    ellipses: Mapping[int, TargetEllipses],
+def find_scale_bar(
+    pair: ScaleBar,
+    ellipses: Mapping[int, ImageEllipses],
     poses: Mapping[int, FloatArray],
     camera: Camera,
     config: BoardConfig,
@@ -58,22 +60,22 @@ def find_marks(
     ratio = pair.circle_radius / pair.length
     fitting = []
     for one, two in combinations(found, 2):
-        gap = np.linalg.norm(one.placement[:3, 3] - two.placement[:3, 3])
+        gap = np.linalg.norm(one.model_from_board[:3, 3] - two.model_from_board[:3, 3])
         radii = np.array([pair.circle_radius / one.scale, pair.circle_radius / two.scale])
         if (np.abs(radii / gap / ratio - 1.0) < SAME_SIZE).all():
             fitting.append((one, two))
     if len(fitting) != 1:
         what = "no two of them have" if not fitting else f"{len(fitting)} pairs of them have"
-        raise MarksError(
-            f"{pair.name}: {len(found)} discs were seen from {LEAST_VIEWS} sides or more, and {what} the size and "
+        raise ScaleBarError(
+            f"{pair.name}: {len(found)} discs were seen from {MIN_VIEWS} sides or more, and {what} the size and "
             "distance of the file: film both marks from several sides, and keep other bright discs out of view"
         )
     return {disc.name: replace(place, board=disc) for disc, place in zip(pair.discs, fitting[0], strict=True)}
 
 
 def _discs(
-    pair: MarkPair,
-    ellipses: Mapping[int, TargetEllipses],
+    pair: ScaleBar,
+    ellipses: Mapping[int, ImageEllipses],
     poses: Mapping[int, FloatArray],
     camera: Camera,
     config: BoardConfig,
@@ -86,7 +88,7 @@ def _discs(
         if any(member in claimed for member in members):
             continue
         place = place_circle(pair.discs[0], start, poses, camera, config, ellipses)
-        if len(place.views) >= LEAST_VIEWS:
+        if len(place.views) >= MIN_VIEWS:
             claimed |= {(view.stamp, *centre) for view in place.views for centre in view.seen.ellipse_centres}
             found.append(place)
     return found
@@ -94,19 +96,19 @@ def _discs(
 
 def _matches(
     stamps: Sequence[int],
-    ellipses: Mapping[int, TargetEllipses],
+    ellipses: Mapping[int, ImageEllipses],
     poses: Mapping[int, FloatArray],
     camera: Camera,
     radius: float,
 ) -> Iterator[tuple[list[tuple[float, ...]], FloatArray]]:
     """Pairs of ellipses that show one disc, the surest first, and the disc's (4, 4) model_from_disc."""
-    if len(stamps) < LEAST_VIEWS:
+    if len(stamps) < MIN_VIEWS:
         return
     places = np.array([-poses[stamp][:3, :3].T @ poses[stamp][:3, 3] for stamp in stamps])
     scores, matches = [], []
-    for first in np.unique(np.linspace(0, len(stamps) - 1, FIRSTS).astype(int)):
+    for first in np.unique(np.linspace(0, len(stamps) - 1, START_IMAGES).astype(int)):
         others = np.argsort(np.linalg.norm(places - places[first], axis=1), kind="stable")[1:]
-        for second in others[np.unique(np.linspace(0, len(others) - 1, PARTNERS).astype(int))]:
+        for second in others[np.unique(np.linspace(0, len(others) - 1, PARTNER_IMAGES).astype(int))]:
             pair = stamps[first], stamps[int(second)]
             for score, rows, start in _pair_matches(pair, ellipses, poses, camera, radius):
                 scores.append(score)
@@ -119,7 +121,7 @@ def _matches(
 
 def _pair_matches(
     stamps: tuple[int, int],
-    ellipses: Mapping[int, TargetEllipses],
+    ellipses: Mapping[int, ImageEllipses],
     poses: Mapping[int, FloatArray],
     camera: Camera,
     radius: float,
@@ -133,8 +135,8 @@ def _pair_matches(
     pixels = [one.centres[rows[:, side]] for side, one in enumerate(seen)]
     rays = [_rays(pixels[side], pose, camera) for side, pose in enumerate(cameras)]
     points, depths, sines = midpoints(origins[0], rays[0], origins[1], rays[1])
-    gates = [np.maximum(EPIPOLAR, 0.5 * one.axes[rows[:, side], 1]) for side, one in enumerate(seen)]
-    good = (sines > LEAST_SINE) & (depths.min(0) > 0)
+    gates = [np.maximum(EPIPOLAR_GATE, 0.5 * one.axes[rows[:, side], 1]) for side, one in enumerate(seen)]
+    good = (sines > MIN_SINE) & (depths.min(0) > 0)
     for projection, pixel, gate in zip(projections, pixels, gates, strict=True):
         image = points @ projection[:, :3].T + projection[:, 3]
         good &= np.linalg.norm(image[:, :2] / image[:, 2:] - pixel, axis=1) < gate
@@ -155,7 +157,7 @@ def _pair_matches(
     mean = normals[0][each, best // 2] + normals[1][each, best % 2]
     for index in np.flatnonzero((scores < SAME_CONIC) & (np.abs(np.log(sizes[0] / sizes[1])) < SAME_SIZE)):
         start = np.eye(4)
-        start[:3, :3] = sizes[:, index].mean() / radius * _turn(mean[index])
+        start[:3, :3] = sizes[:, index].mean() / radius * _rotation_to_normal(mean[index])
         start[:3, 3] = points[index]
         yield float(scores[index]), (int(rows[index, 0]), int(rows[index, 1])), start
 
@@ -166,7 +168,7 @@ def _rays(pixels: FloatArray, pose: FloatArray, camera: Camera) -> FloatArray:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def _turn(normal: FloatArray) -> NDArray[np.float64]:
+def _rotation_to_normal(normal: FloatArray) -> NDArray[np.float64]:
     """(3, 3) rotation whose z axis is along `normal`."""
     z = normal / np.linalg.norm(normal)
     x = np.cross(z, np.eye(3)[np.abs(z).argmin()])

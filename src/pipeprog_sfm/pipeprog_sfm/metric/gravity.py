@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.metric.map_frame import Vertical
 
-STANDARD = 9.80665  # m/s^2
-DEVIATION = 0.5  # m/s^2: gravity varies by 0.03 over the Earth, cheap accelerometers err by a few tenths
-LEAST_SECONDS = 2.0  # over which a hand's or a robot's own accelerations cancel
+STANDARD_GRAVITY = 9.80665  # m/s^2
+MAX_DEVIATION = 0.5  # m/s^2: gravity varies by 0.03 over the Earth, cheap accelerometers err by a few tenths
+MIN_SECONDS = 2.0  # over which a hand's or a robot's own accelerations cancel
 
 
 class GravityError(Exception):
@@ -42,7 +42,7 @@ def gravity(
     inside = (stamps >= times[0]) & (stamps <= times[-1])
     at, forces = (stamps[inside] - times[0]) * 1e-9, forces_in_camera[inside]
     whole = float(seconds[-1])
-    if whole < LEAST_SECONDS or len(at) < 10 or np.diff(np.r_[0.0, np.sort(at), whole]).max() > 0.2 * whole:
+    if whole < MIN_SECONDS or len(at) < 10 or np.diff(np.r_[0.0, np.sort(at), whole]).max() > 0.2 * whole:
         raise GravityError("the accelerations of the IMU do not cover the keyframes: record them all the way")
     stack = np.stack(list(poses.values()))
     model_from_camera = Slerp(seconds, Rotation.from_matrix(stack[:, :3, :3].transpose(0, 2, 1)))
@@ -56,8 +56,8 @@ def gravity(
     mean_place = (0.5 * (centres[1:] + centres[:-1]) * np.diff(seconds)[:, None]).sum(0) / whole
     up = felt - 12.0 / whole**2 * (0.5 * (centres[0] + centres[-1]) - mean_place)
     size = float(np.linalg.norm(up))
-    if abs(size - STANDARD) > DEVIATION:
+    if abs(size - STANDARD_GRAVITY) > MAX_DEVIATION:
         raise GravityError(
-            f"the IMU feels {size:.2f} m/s^2 on average, not {STANDARD:.2f}: check its unit and its transform"
+            f"the IMU feels {size:.2f} m/s^2 on average, not {STANDARD_GRAVITY:.2f}: check its unit and its transform"
         )
     return Vertical(up / size, "IMU")

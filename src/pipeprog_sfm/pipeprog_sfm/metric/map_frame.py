@@ -10,10 +10,10 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.board import symmetries
 from pipeprog_sfm.boards.placed_board import PlacedBoard
-from pipeprog_sfm.metric.transform_tree import Path
+from pipeprog_sfm.metric.transform_tree import CameraPath
 
-STEEPEST = np.cos(np.radians(30.0))  # an axis nearer to the vertical tells no heading
-DISAGREEMENT = np.radians(5.0)  # of two verticals: more than a board hung by eye or a cheap accelerometer errs by
+MAX_STEEPNESS = np.cos(np.radians(30.0))  # an axis nearer to the vertical tells no heading
+MAX_DISAGREEMENT = np.radians(5.0)  # of two verticals: more than a board hung by eye or a cheap accelerometer errs by
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def board_vertical(place: PlacedBoard, poses: Mapping[int, FloatArray]) -> tuple
     return place, Vertical(axes[:, 1], f"board {place.board.name}"), text
 
 
-def path_vertical(path: Path, poses: Mapping[int, FloatArray]) -> Vertical:
+def path_vertical(path: CameraPath, poses: Mapping[int, FloatArray]) -> Vertical:
     """The z axis of the frame that odometry moves in, which REP 103 has up."""
     ups = [
         poses[int(stamp)][:3, :3].T @ pose[2, :3]
@@ -76,12 +76,12 @@ def map_from_model(
     vertical = verticals[0]
     if place is not None:
         place = _turned_up(place, vertical.up_in_model)
-        axes, origin, where = _axes(place), place.placement[:3, 3], f"board {place.board.name}"
+        axes, origin, where = _axes(place), place.model_from_board[:3, 3], f"board {place.board.name}"
     else:
         first = next(iter(poses.values()))
         axes, origin, where = first[:3, :3].T * [1.0, -1.0, -1.0], -first[:3, :3].T @ first[:3, 3], "first keyframe"
     up = vertical.up_in_model
-    ahead = axes[:, 0] if abs(axes[:, 0] @ up) < STEEPEST else axes[:, 1]
+    ahead = axes[:, 0] if abs(axes[:, 0] @ up) < MAX_STEEPNESS else axes[:, 1]
     x = ahead - (ahead @ up) * up
     x /= np.linalg.norm(x)
     linear = scale * np.stack([x, np.cross(up, x), up])
@@ -91,18 +91,18 @@ def map_from_model(
         f"z of the map is up by {vertical.source}, and {np.degrees(angle):.0f} degrees off up by {other.source}: "
         "one of the two is wrong"
         for other in verticals[1:]
-        if (angle := np.arccos(np.clip(other.up_in_model @ up, -1.0, 1.0))) > DISAGREEMENT
+        if (angle := np.arccos(np.clip(other.up_in_model @ up, -1.0, 1.0))) > MAX_DISAGREEMENT
     )
     return frame, f"origin: {where}, z up: {vertical.source}", warnings
 
 
 def _axes(place: PlacedBoard) -> FloatArray:
     """(3, 3) rotation model_from_board."""
-    return place.placement[:3, :3] * place.scale
+    return place.model_from_board[:3, :3] * place.scale
 
 
 def _turned_up(place: PlacedBoard, up: FloatArray) -> PlacedBoard:
     """The board with its y axis up, where that cannot be told from upside down."""
     if _axes(place)[:, 1] @ up >= 0 or len(symmetries(place.board)) == 1:
         return place
-    return place.turned()
+    return place.upside_down()

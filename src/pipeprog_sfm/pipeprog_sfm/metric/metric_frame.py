@@ -10,13 +10,13 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
-from pipeprog_sfm.boards.board_adjustment import sensitivity
+from pipeprog_sfm.boards.board_adjustment import placement_sensitivity
 from pipeprog_sfm.boards.board_check import BoardPlacement, contradiction, measure
-from pipeprog_sfm.boards.board_file import Targets
+from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.board_triangulation import place_boards
-from pipeprog_sfm.boards.ellipses import TargetEllipses
+from pipeprog_sfm.boards.ellipses import ImageEllipses
 from pipeprog_sfm.boards.placed_board import PlacedBoard
-from pipeprog_sfm.boards.scale_bar import MarksError, find_marks
+from pipeprog_sfm.boards.scale_bar import ScaleBarError, find_scale_bar
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.metric.gravity import GravityError, gravity
 from pipeprog_sfm.metric.map_frame import Vertical, board_vertical, camera_up, map_from_model, path_vertical
@@ -32,15 +32,15 @@ from pipeprog_sfm.metric.scale import (
     distance_measurement,
 )
 from pipeprog_sfm.metric.transform_tree import Acceleration, NoPathError, TransformTree
-from pipeprog_sfm.metric.vertical_from_planes import StructureError, structure_vertical
+from pipeprog_sfm.metric.vertical_from_planes import PlanesError, vertical_from_planes
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What was seen of targets, and what a robot told of its motion.
+class ScaleEvidence:
+    """What was seen of boards and scale bars, and what a robot told of its motion.
 
     Attributes:
-        targets: what the file says.
+        board_file: what the file says.
         observations: boards seen, by image stamp [ns].
         ellipses: all ellipses of the images, by stamp: boards of which only a circle is in view take part, too.
         transforms: odometry and TF.
@@ -50,9 +50,9 @@ class Evidence:
             it is mounted.
     """
 
-    targets: Targets = Targets()  # noqa: RUF009  # frozen
+    board_file: BoardFile = BoardFile()  # noqa: RUF009  # frozen
     observations: Mapping[int, Sequence[BoardObservation]] = field(default_factory=dict)
-    ellipses: Mapping[int, TargetEllipses] | None = None
+    ellipses: Mapping[int, ImageEllipses] | None = None
     transforms: TransformTree = field(default_factory=TransformTree)
     accelerations: Sequence[Acceleration] = ()
     camera_frame: str = ""
@@ -60,7 +60,7 @@ class Evidence:
 
 
 def estimate_scale(
-    evidence: Evidence,
+    evidence: ScaleEvidence,
     poses: Mapping[int, FloatArray],
     camera: Camera,
     config: BoardConfig,
@@ -93,22 +93,24 @@ def estimate_scale(
         places, placements, warnings = _sound_boards(evidence, poses, camera, config)
     except NoScaleError as error:
         refusal = error
-    inherited = [sensitivity(place, poses, camera, config) for place in places]
+    inherited = [placement_sensitivity(place, poses, camera, config) for place in places]
     measurements += [board_measurement(*pair, stamps, config) for pair in zip(places, inherited, strict=True)]
     by_name = {place.board.name: (place, own) for place, own in reversed(list(zip(places, inherited, strict=True)))}
-    for distance in evidence.targets.distances:
+    for distance in evidence.board_file.distances:
         measurement = distance_measurement(distance, by_name, stamps)
         if measurement is None:
             warnings.append(f"the distance {distance.name} tells nothing: its boards were not both measured")
         else:
             measurements.append(measurement)
-    for pair in evidence.targets.marks:
+    for pair in evidence.board_file.scale_bars:
         try:
-            ends = find_marks(pair, _loose(evidence, places), poses, camera, config)
-        except MarksError as error:
+            ends = find_scale_bar(pair, _loose(evidence, places), poses, camera, config)
+        except ScaleBarError as error:
             warnings.append(str(error))
         else:
-            placed = {name: (place, sensitivity(place, poses, camera, config)) for name, place in ends.items()}
+            placed = {
+                name: (place, placement_sensitivity(place, poses, camera, config)) for name, place in ends.items()
+            }
             measurements += [one for one in [distance_measurement(pair.distance, placed, stamps)] if one]
     found, texts = rig_measurements(evidence.frames, evidence.transforms, poses, odometry)
     measurements += found
@@ -125,7 +127,7 @@ def estimate_scale(
             measurements.append(odometry_measurement(path, poses, odometry))
         except (NoPathError, OdometryError) as error:
             warnings.append(str(error))
-    if refusal is not None and (not measurements or evidence.targets.boards):
+    if refusal is not None and (not measurements or evidence.board_file.boards):
         warnings.insert(0, str(refusal))
     if not measurements:
         assert refusal is not None
@@ -146,8 +148,8 @@ def estimate_scale(
         verticals.append(path_vertical(path, poses))
     if not verticals:
         try:
-            verticals.append(structure_vertical(points() if points else np.empty((0, 3)), camera_up(poses)))
-        except StructureError as error:
+            verticals.append(vertical_from_planes(points() if points else np.empty((0, 3)), camera_up(poses)))
+        except PlanesError as error:
             raise NoScaleError(
                 "no_vertical", f"{error}: hang the board upright and set upright to true, or record an IMU or odometry"
             ) from error
@@ -165,34 +167,34 @@ def estimate_scale(
     )
 
 
-def _gravity(evidence: Evidence, poses: Mapping[int, FloatArray], scale: float) -> Vertical:
+def _gravity(evidence: ScaleEvidence, poses: Mapping[int, FloatArray], scale: float) -> Vertical:
     frames = {one.frame for one in evidence.accelerations}
     turns = {frame: evidence.transforms.static_transform(evidence.camera_frame, frame) for frame in frames}
     forces = np.stack([turns[one.frame][:3, :3] @ one.force for one in evidence.accelerations])
     return gravity(np.array([one.stamp for one in evidence.accelerations], np.int64), forces, poses, scale)
 
 
-def _loose(evidence: Evidence, places: Sequence[PlacedBoard]) -> dict[int, TargetEllipses]:
+def _loose(evidence: ScaleEvidence, places: Sequence[PlacedBoard]) -> dict[int, ImageEllipses]:
     """The ellipses that belong to no board."""
     taken = {(view.stamp, *centre) for place in places for view in place.views for centre in view.seen.ellipse_centres}
     loose = {}
     for stamp, seen in (evidence.ellipses or {}).items():
         free = np.array([(stamp, *centre) not in taken for centre in seen.centres], bool)
-        loose[stamp] = TargetEllipses(seen.centres[free], seen.shapes[free], seen.rms[free])
+        loose[stamp] = ImageEllipses(seen.centres[free], seen.shapes[free], seen.rms[free])
     return loose
 
 
 def _sound_boards(
-    evidence: Evidence, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig
+    evidence: ScaleEvidence, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig
 ) -> tuple[list[PlacedBoard], list[BoardPlacement], list[str]]:
     """Boards that agree with their file, what was measured of them, and why others were refused."""
-    if not evidence.targets.boards:
+    if not evidence.board_file.boards:
         raise NoScaleError("no_board", "nothing tells the scale: hang up a board and name its file, or record odometry")
     seen = sum(stamp in poses and len(found) > 0 for stamp, found in evidence.observations.items())
     if not seen:
-        names = ", ".join(board.name for board in evidence.targets.boards)
+        names = ", ".join(board.name for board in evidence.board_file.boards)
         raise NoScaleError("no_board", f"no board ({names}) was identified in any of {len(poses)} images with a pose")
-    found = place_boards(evidence.observations, poses, camera, evidence.targets.boards, config, evidence.ellipses)
+    found = place_boards(evidence.observations, poses, camera, evidence.board_file.boards, config, evidence.ellipses)
     if not found:
         raise NoScaleError("too_few_views", f"a board was seen in {seen} images, but from too few sides to be measured")
     measured = [(place, measure(place, poses, camera, config)) for place in found]

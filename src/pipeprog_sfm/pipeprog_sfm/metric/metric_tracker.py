@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
-from pipeprog_sfm.boards.board_detection import identify
-from pipeprog_sfm.boards.board_file import Targets
-from pipeprog_sfm.boards.ellipses import TargetEllipses, find_ellipses
+from pipeprog_sfm.boards.board_detection import detect_boards
+from pipeprog_sfm.boards.board_file import BoardFile
+from pipeprog_sfm.boards.ellipses import ImageEllipses, detect_ellipses
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
-from pipeprog_sfm.metric.metric_frame import Evidence, estimate_scale
+from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
 from pipeprog_sfm.metric.scale import NoScaleError, PoseCovariance, ScaleEstimate
-from pipeprog_sfm.metric.transform_tree import Acceleration, Motion, TransformTree
+from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, TransformTree
 
 
-class BoardTracker:
+class MetricTracker:
     """Keeps the ellipses and the identified boards of every keyframe, not the images, and what a robot's motion was."""
 
     def __init__(
         self,
-        targets: Targets,
+        targets: BoardFile,
         config: BoardConfig,
         odometry: OdometryConfig = OdometryConfig(),  # noqa: B008  # frozen
     ) -> None:
@@ -34,7 +34,7 @@ class BoardTracker:
         self._camera: Camera | None = None
         self._frame: str | None = None
         self._frames: dict[int, str] = {}
-        self._ellipses: dict[int, TargetEllipses] = {}
+        self._ellipses: dict[int, ImageEllipses] = {}
         self._observations: dict[int, list[BoardObservation]] = {}
         self._transforms = TransformTree()
         self._accelerations: list[Acceleration] = []
@@ -54,15 +54,15 @@ class BoardTracker:
         if frame != self._frame:
             return []
         self._camera = camera
-        ellipses = find_ellipses(gray, camera, self._config)
-        found = identify(ellipses, self._targets.boards, camera)
+        ellipses = detect_ellipses(gray, camera, self._config)
+        found = detect_boards(ellipses, self._targets.boards, camera)
         if len(ellipses):
             self._ellipses[stamp] = ellipses
         if found:
             self._observations[stamp] = found
         return found
 
-    def move(self, motion: Motion) -> None:
+    def move(self, motion: RobotMotion) -> None:
         """Takes what odometry, TF and IMU have told since the last call."""
         self._transforms.add(motion.transforms)
         self._accelerations += motion.accelerations
@@ -83,7 +83,7 @@ class BoardTracker:
         """Scale and map frame for (4, 4) poses camera_from_model by stamp; the rest as for `estimate_scale`."""
         if self._camera is None or self._frame is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
-        evidence = Evidence(
+        evidence = ScaleEvidence(
             self._targets,
             self._observations,
             self._ellipses,

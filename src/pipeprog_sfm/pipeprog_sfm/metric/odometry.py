@@ -9,19 +9,19 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import OdometryConfig
 from pipeprog_sfm.metric.scale import Measurement, trajectory_gradient
-from pipeprog_sfm.metric.transform_tree import Path
+from pipeprog_sfm.metric.transform_tree import CameraPath
 
 SEGMENTS = 20  # of the way: long enough to drown the jitter of single poses, many enough to tell the odd ones
-LEAST_SEGMENTS = 4  # from which a spread can be told
+MIN_SEGMENTS = 4  # from which a spread can be told
 CAUCHY = 2.385  # 95 % efficiency for normal errors (Holland, Welsch 1977)
-MISFIT = 0.3  # median error of a segment over its length from which odometry and camera did not move together
+MAX_MISFIT = 0.3  # median error of a segment over its length from which odometry and camera did not move together
 
 
 class OdometryError(Exception):
     """The odometry tells no scale; the text says why."""
 
 
-def odometry_measurement(path: Path, poses: Mapping[int, FloatArray], config: OdometryConfig) -> Measurement:
+def odometry_measurement(path: CameraPath, poses: Mapping[int, FloatArray], config: OdometryConfig) -> Measurement:
     """The scale by the displacements along the way, each as the camera at its beginning saw it.
 
     Displacements in the camera's own frame need no alignment of the two paths, and a heading that drifts or a wheel
@@ -46,7 +46,7 @@ def odometry_measurement(path: Path, poses: Mapping[int, FloatArray], config: Od
     way = np.append(0.0, np.cumsum(steps))
     wanted = np.searchsorted(way, np.linspace(0.0, way[-1], SEGMENTS + 1)).clip(0, len(way) - 1)
     ends = np.unique(wanted)
-    if len(ends) <= LEAST_SEGMENTS:
+    if len(ends) <= MIN_SEGMENTS:
         raise OdometryError(f"odometry covers {len(stamps)} keyframes, too few for a scale")
     begin, end = ends[:-1], ends[1:]
     moved, told = (
@@ -58,7 +58,7 @@ def odometry_measurement(path: Path, poses: Mapping[int, FloatArray], config: Od
     if scale <= 0:
         raise OdometryError("odometry says that the camera stood still")
     misfit = np.linalg.norm(told - scale * moved, axis=1) / (scale * length)
-    if np.median(misfit) > MISFIT:
+    if np.median(misfit) > MAX_MISFIT:
         raise OdometryError(
             "odometry and camera did not move together: check the transform between them and that their clocks agree"
         )

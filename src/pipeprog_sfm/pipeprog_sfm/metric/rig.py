@@ -12,10 +12,10 @@ from pipeprog_sfm.config import OdometryConfig
 from pipeprog_sfm.metric.scale import Measurement
 from pipeprog_sfm.metric.transform_tree import NoPathError, TransformTree
 
-LARGEST_SKEW = 1_000_000  # ns between the images of a pair: at a walk the body moves by a millimetre
-LEAST_PAIRS = 3  # from which a spread can be told
+MAX_SKEW = 1_000_000  # ns between the images of a pair: at a walk the body moves by a millimetre
+MIN_PAIRS = 3  # from which a spread can be told
 CAUCHY = 2.385  # 95 % efficiency for normal errors (Holland, Welsch 1977)
-MISFIT = 0.3  # median error of a pair over the baseline from which the cameras are not mounted as it is said
+MAX_MISFIT = 0.3  # median error of a pair over the baseline from which the cameras are not mounted as it is said
 
 
 class RigError(Exception):
@@ -58,19 +58,19 @@ def _measurement(
     names = f"the cameras '{one}' and '{other}'"
     baseline = one_from_other[:3, 3]
     length = float(np.linalg.norm(baseline))
-    if MISFIT * length < config.baseline_sigma:
+    if MAX_MISFIT * length < config.baseline_sigma:
         raise RigError(f"{names} are as good as in one place, says /tf_static: they tell no scale")
     pairs = _pairs(one, other, frames, poses)
-    if len(pairs) < LEAST_PAIRS:
+    if len(pairs) < MIN_PAIRS:
         raise RigError(
-            f"{len(pairs)} images of {names} are of one moment (within {LARGEST_SKEW * 1e-6:g} ms): too few for a scale"
+            f"{len(pairs)} images of {names} are of one moment (within {MAX_SKEW * 1e-6:g} ms): too few for a scale"
         )
     first, second = (np.stack([poses[pair[side]] for pair in pairs]) for side in (0, 1))
     centres = -np.einsum("nji,nj->ni", second[:, :3, :3], second[:, :3, 3])
     found = np.einsum("nij,nj->ni", first[:, :3, :3], centres) + first[:, :3, 3]
     along = found @ baseline / length**2  # model units per metre
     scale = 1.0 / max(float(np.median(along)), 1e-12)
-    if np.median(np.linalg.norm(scale * found - baseline, axis=1)) > MISFIT * length:
+    if np.median(np.linalg.norm(scale * found - baseline, axis=1)) > MAX_MISFIT * length:
         raise RigError(f"{names} are not mounted as /tf_static says, or their clocks do not agree")
     mean = float(np.median(along))
     for _ in range(20):
@@ -97,7 +97,7 @@ def _pairs(one: str, other: str, frames: Mapping[int, str], poses: Mapping[int, 
     return [
         (int(first[row]), int(second[column]))
         for row, column in enumerate(nearest)
-        if back[column] == row and gap[row, column] <= LARGEST_SKEW
+        if back[column] == row and gap[row, column] <= MAX_SKEW
     ]
 
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_sfm.boards.board_adjustment import Sensitivity
+from pipeprog_sfm.boards.board_adjustment import PlacementSensitivity
 from pipeprog_sfm.boards.board_check import BoardPlacement
-from pipeprog_sfm.boards.board_file import Distance
+from pipeprog_sfm.boards.board_file import KnownDistance
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.boards.triangulation import cross_matrices
 from pipeprog_sfm.config import BoardConfig
@@ -24,7 +24,7 @@ from pipeprog_sfm.config import BoardConfig
 # Of functions of the poses: (S, N, 6) derivatives, poses in order of time, -> (S, S).
 PoseCovariance = Callable[[FloatArray], FloatArray]
 
-LARGEST_SIGMA = 0.05  # relative; a scale known worse than that is not published
+MAX_SIGMA = 0.05  # relative; a scale known worse than that is not published
 
 
 class NoScaleError(Exception):
@@ -96,7 +96,7 @@ class Combined:
 
 
 def board_measurement(
-    place: PlacedBoard, inherited: Sensitivity, stamps: Sequence[int], config: BoardConfig
+    place: PlacedBoard, inherited: PlacementSensitivity, stamps: Sequence[int], config: BoardConfig
 ) -> Measurement:
     """The scale by one board: from the scatter of its images and the tolerance of its circles."""
     sigma = float(np.hypot(place.sigma, config.tolerance / place.board.spread))
@@ -107,7 +107,7 @@ def board_measurement(
 
 
 def distance_measurement(
-    distance: Distance, places: Mapping[str, tuple[PlacedBoard, Sensitivity]], stamps: Sequence[int]
+    distance: KnownDistance, places: Mapping[str, tuple[PlacedBoard, PlacementSensitivity]], stamps: Sequence[int]
 ) -> Measurement | None:
     """The scale by a measured distance between two circles, or None where their boards have no place."""
     if not all(board in places for board, _ in distance.ends):
@@ -115,8 +115,8 @@ def distance_measurement(
     points, by_placement = [], []
     for board, circle in distance.ends:
         place, _ = places[board]
-        arm = place.placement[:3, :3] @ (place.board.centres[circle] - place.board.centres.mean(0))
-        points.append(place.placement[:3, :3] @ place.board.centres[circle] + place.placement[:3, 3])
+        arm = place.model_from_board[:3, :3] @ (place.board.centres[circle] - place.board.centres.mean(0))
+        points.append(place.model_from_board[:3, :3] @ place.board.centres[circle] + place.model_from_board[:3, 3])
         by_placement.append(np.c_[-cross_matrices(arm[None])[0], np.eye(3), arm])
     gap = points[1] - points[0]
     length = float(np.linalg.norm(gap))
@@ -153,7 +153,7 @@ def combine(
     weights /= weights.sum()
     log_scale = float(weights @ logs)
     sigma = float(np.sqrt(weights @ joint @ weights))
-    if not sigma <= LARGEST_SIGMA:
+    if not sigma <= MAX_SIGMA:
         raise NoScaleError(
             "too_uncertain",
             f"the scale is known to {100 * sigma:.1f} % only: film the board from more sides, or measure a distance",

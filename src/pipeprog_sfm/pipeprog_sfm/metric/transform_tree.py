@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pipeprog_camera.arrays import FloatArray
 
-LONGEST_GAP = 500_000_000  # ns between two poses that are interpolated: a walker's step
+MAX_GAP = 500_000_000  # ns between two poses that are interpolated: a walker's step
 ODOMETRY_FRAME = "odom"  # REP 105: continuous, while the frames above it may jump
 
 
@@ -38,7 +38,7 @@ class Acceleration:
 
 
 @dataclass(frozen=True)
-class Motion:
+class RobotMotion:
     """What has been told of a robot's motion, in any order."""
 
     transforms: tuple[Transform, ...] = ()
@@ -46,7 +46,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Path:
+class CameraPath:
     """fixed_from_camera (M, 4, 4) at stamps (M,) [ns] in order of time, in the frame `fixed`."""
 
     fixed: str
@@ -77,7 +77,7 @@ class TransformTree:
                 samples = self._moving.setdefault(transform.child, {}).setdefault(transform.parent, [])
                 insort(samples, transform, key=lambda one: (one.stamp, one.parent_from_child.tobytes()))
 
-    def path(self, camera: str, stamps: Sequence[int]) -> Path:
+    def path(self, camera: str, stamps: Sequence[int]) -> CameraPath:
         """Poses of the frame `camera` in the frame at the root of its tree, at those stamps [ns] that are covered.
 
         The root is the odometry frame of REP 105 where there is one, since frames above it may jump.
@@ -106,7 +106,7 @@ class TransformTree:
             else:
                 found, known = _interpolated(self._moving[child][parent], times)
                 poses, covered = found @ poses, covered & known
-        return Path(chain[-1], times[covered], poses[covered])
+        return CameraPath(chain[-1], times[covered], poses[covered])
 
     def static_transform(self, to: str, source: str) -> FloatArray:
         """(4, 4) to_from_source of two frames mounted on one body; raises NoPathError."""
@@ -144,7 +144,7 @@ def _interpolated(samples: Sequence[Transform], times: NDArray[np.int64]) -> tup
     before = np.where(stamps[after] > times, after - 1, after)
     known = (before >= 0) & (stamps[after] >= times)
     before = np.maximum(before, 0)
-    known &= stamps[after] - stamps[before] <= LONGEST_GAP
+    known &= stamps[after] - stamps[before] <= MAX_GAP
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     if not known.any():
         return poses, known

@@ -2,7 +2,7 @@ import pytest
 from targets import BOARD
 
 from pipeprog_camera.errors import InputError
-from pipeprog_sfm.boards.board_file import Distance, MarkPair, load_targets
+from pipeprog_sfm.boards.board_file import KnownDistance, ScaleBar, load_board_file
 
 GOOD = """boards:
   - name: A
@@ -14,7 +14,7 @@ GOOD = """boards:
 def test_reads_the_boards_of_a_file(tmp_path):
     path = tmp_path / "board.yaml"
     path.write_text(GOOD)
-    (board,) = load_targets(path).boards
+    (board,) = load_board_file(path).boards
     assert board.name == "A"
     assert board.circle_radius == 0.04
     assert board.centres == pytest.approx(BOARD.centres)
@@ -50,14 +50,14 @@ def test_refuses_a_bad_file_and_says_why(tmp_path, old, new, words):
     assert old in GOOD
     path.write_text(GOOD.replace(old, new))
     with pytest.raises(InputError) as caught:
-        load_targets(path)
+        load_board_file(path)
     for word in [*words, str(path)]:
         assert word in str(caught.value)
 
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match="none\\.yaml"):
-        load_targets(tmp_path / "none.yaml")
+        load_board_file(tmp_path / "none.yaml")
 
 
 DISTANCE = "distances:\n  - {from: A/1, to: A/2, distance_mm: 480.2, sigma_mm: 0.5}\n"
@@ -66,10 +66,10 @@ DISTANCE = "distances:\n  - {from: A/1, to: A/2, distance_mm: 480.2, sigma_mm: 0
 def test_reads_the_distances_of_a_file(tmp_path):
     path = tmp_path / "board.yaml"
     path.write_text(GOOD + DISTANCE)
-    (distance,) = load_targets(path).distances
-    assert distance == Distance("A/1 to A/2", (("A", 0), ("A", 1)), 0.4802, 0.0005)
+    (distance,) = load_board_file(path).distances
+    assert distance == KnownDistance("A/1 to A/2", (("A", 0), ("A", 1)), 0.4802, 0.0005)
     path.write_text(GOOD)
-    assert load_targets(path).distances == ()
+    assert load_board_file(path).distances == ()
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_refuses_a_bad_distance_and_says_why(tmp_path, old, new, words):
     path = tmp_path / "board.yaml"
     path.write_text(GOOD + DISTANCE.replace(old, new))
     with pytest.raises(InputError, match="distance 1") as caught:
-        load_targets(path)
+        load_board_file(path)
     for word in [*words, str(path)]:
         assert word in str(caught.value)
 
@@ -99,8 +99,8 @@ def test_reads_marks_with_and_without_boards(tmp_path):
     path = tmp_path / "board.yaml"
     for text, boards in ((MARKS, 0), (GOOD + MARKS, 1)):
         path.write_text(text)
-        targets = load_targets(path)
-        assert targets.marks == (MarkPair("marks 1", 0.05, 2.134, 0.0015),)
+        targets = load_board_file(path)
+        assert targets.scale_bars == (ScaleBar("marks 1", 0.05, 2.134, 0.0015),)
         assert len(targets.boards) == boards
 
 
@@ -119,6 +119,6 @@ def test_refuses_bad_marks_and_says_why(tmp_path, old, new, words):
     path = tmp_path / "board.yaml"
     path.write_text(MARKS.replace(old, new))
     with pytest.raises(InputError) as caught:
-        load_targets(path)
+        load_board_file(path)
     for word in [*words, str(path)]:
         assert word in str(caught.value)

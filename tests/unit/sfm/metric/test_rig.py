@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from targets import CAMERA
 
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
-from pipeprog_sfm.metric.metric_frame import Evidence, estimate_scale
+from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
 from pipeprog_sfm.metric.rig import rig_measurements
 from pipeprog_sfm.metric.transform_tree import Transform, TransformTree
 from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
@@ -116,7 +116,7 @@ def test_a_rig_is_weighed_against_odometry():
     for stretch, disagree in ((1.0, False), (1.1, True)):
         tree = pair.tree(noise=0.002, stretch=stretch)
         tree.add([Transform(0, "camera", "right", LEFT_FROM_RIGHT, True)])
-        evidence = Evidence(transforms=tree, camera_frame="camera", frames=pair.frames)
+        evidence = ScaleEvidence(transforms=tree, camera_frame="camera", frames=pair.frames)
         config = replace(BoardConfig(), upright=False)
         estimate = estimate_scale(evidence, pair.poses, CAMERA, config, OdometryConfig())
         assert estimate.source == "rig+odometry"

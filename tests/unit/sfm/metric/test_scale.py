@@ -7,22 +7,22 @@ from hypothesis import strategies as st
 from targets import BOARD, CAMERA, LOPSIDED, Walk, camera_from_board, exact_ellipses, render
 
 from pipeprog_sfm.boards.board import Board
-from pipeprog_sfm.boards.board_detection import identify
-from pipeprog_sfm.boards.board_file import Distance, Targets
+from pipeprog_sfm.boards.board_detection import detect_boards
+from pipeprog_sfm.boards.board_file import BoardFile, KnownDistance
 from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import BoardConfig
-from pipeprog_sfm.metric.metric_frame import Evidence, estimate_scale
-from pipeprog_sfm.metric.metric_tracker import BoardTracker
+from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
+from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import NoScaleError
-from pipeprog_sfm.metric.vertical_from_planes import StructureError, structure_vertical
+from pipeprog_sfm.metric.vertical_from_planes import PlanesError, vertical_from_planes
 from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covariance
 
 CONFIG = BoardConfig()
 
 
 def told(walk, boards=(BOARD,), config=CONFIG, distances=()):
-    seen = {stamp: identify(ellipses, boards, CAMERA) for stamp, ellipses in walk.ellipses.items()}
-    return estimate_scale(Evidence(Targets(boards, distances), seen, walk.ellipses), walk.poses, CAMERA, config)
+    seen = {stamp: detect_boards(ellipses, boards, CAMERA) for stamp, ellipses in walk.ellipses.items()}
+    return estimate_scale(ScaleEvidence(BoardFile(boards, distances), seen, walk.ellipses), walk.poses, CAMERA, config)
 
 
 @settings(max_examples=8, deadline=None)
@@ -121,7 +121,7 @@ def far_apart(seed, views=24):
 
 def test_a_known_distance_between_boards_sharpens_the_scale():
     walk, length = far_apart(1), np.linalg.norm([6.0 + 0.06, 0.02])
-    distance = Distance("A/1 to B/1", (("A", 0), ("B", 0)), length, 0.0002)
+    distance = KnownDistance("A/1 to B/1", (("A", 0), ("B", 0)), length, 0.0002)
     alone, both = told(walk, (BOARD, LOPSIDED)), told(walk, (BOARD, LOPSIDED), distances=(distance,))
     assert alone.source == "board"
     assert both.source == "board+known_distance"
@@ -132,7 +132,7 @@ def test_a_known_distance_between_boards_sharpens_the_scale():
 
 def test_a_wrong_distance_is_told():
     walk = far_apart(2)
-    distance = Distance("A/1 to B/1", (("A", 0), ("B", 0)), 5.9, 0.001)
+    distance = KnownDistance("A/1 to B/1", (("A", 0), ("B", 0)), 5.9, 0.001)
     estimate = told(walk, (BOARD, LOPSIDED), distances=(distance,))
     assert any("the distance A/1 to B/1" in text and "off" in text for text in estimate.warnings)
     assert estimate.sigma > 3 * told(walk, (BOARD, LOPSIDED)).sigma
@@ -206,10 +206,10 @@ def test_floor_and_walls_tell_what_is_up(surfaces):
     rng = np.random.default_rng(0)
     walk = Walk(1, roll=0.2)
     points = room(rng, surfaces) @ walk.model_from_board[:3, :3].T + walk.model_from_board[:3, 3]
-    seen = {stamp: identify(ellipses, (BOARD,), CAMERA) for stamp, ellipses in walk.ellipses.items()}
+    seen = {stamp: detect_boards(ellipses, (BOARD,), CAMERA) for stamp, ellipses in walk.ellipses.items()}
     config = replace(CONFIG, upright=False)
     estimate = estimate_scale(
-        Evidence(Targets((BOARD,)), seen, walk.ellipses), walk.poses, CAMERA, config, points=lambda: points
+        ScaleEvidence(BoardFile((BOARD,)), seen, walk.ellipses), walk.poses, CAMERA, config, points=lambda: points
     )
     up = (estimate.map_from_model @ walk.model_from_board)[:3, 1]
     assert np.degrees(np.arccos(up @ [0, 0, 1] / np.linalg.norm(up))) < 0.5
@@ -219,14 +219,14 @@ def test_floor_and_walls_tell_what_is_up(surfaces):
 def test_one_wall_or_a_cloud_of_nothing_tell_no_vertical():
     rng = np.random.default_rng(1)
     for points in (room(rng, [(2, 0.0)]), rng.normal(0, 1, (5000, 3)), np.empty((0, 3))):
-        with pytest.raises(StructureError):
-            structure_vertical(points, np.array([0.0, 1.0, 0.0]))
+        with pytest.raises(PlanesError):
+            vertical_from_planes(points, np.array([0.0, 1.0, 0.0]))
 
 
 def test_reasons_for_no_scale():
     walk = Walk(8)
     with pytest.raises(NoScaleError, match="nothing tells the scale") as caught:
-        estimate_scale(Evidence(), walk.poses, CAMERA, CONFIG)
+        estimate_scale(ScaleEvidence(), walk.poses, CAMERA, CONFIG)
     with pytest.raises(NoScaleError, match="B") as caught:
         told(walk, (LOPSIDED,))
     assert caught.value.reason == "no_board"
@@ -235,11 +235,11 @@ def test_reasons_for_no_scale():
         told(walk)
     assert caught.value.reason == "too_few_views"
     with pytest.raises(NoScaleError, match="no keyframe"):
-        BoardTracker(Targets([BOARD]), CONFIG).estimate({})
+        MetricTracker(BoardFile([BOARD]), CONFIG).estimate({})
 
 
 def test_tracker_measures_rendered_images():
-    tracker, places, walk = BoardTracker(Targets([BOARD]), CONFIG), (-0.6, 0.0, 0.6), Walk(9)
+    tracker, places, walk = MetricTracker(BoardFile([BOARD]), CONFIG), (-0.6, 0.0, 0.6), Walk(9)
     poses = {}
     for stamp, x in enumerate(places):
         pose = camera_from_board((x, 0.05, 1.3), (0.3 * x, 0, 0))
@@ -286,8 +286,8 @@ class DriftingWalk:
             self.poses[stamp][:3, :3], self.poses[stamp][:3, 3] = result.rotation[stamp], result.translation[stamp]
         self.covariance = lambda gradients: function_covariance(gradients, result, loss_scale=loss_scale)
         ellipses = {stamp: exact_ellipses([BOARD], [true[stamp]], noise=0.03, rng=rng) for stamp in range(views)}
-        seen_boards = {stamp: identify(found, (BOARD,), CAMERA) for stamp, found in ellipses.items()}
-        self.evidence = Evidence(Targets((BOARD,)), seen_boards, ellipses)
+        seen_boards = {stamp: detect_boards(found, (BOARD,), CAMERA) for stamp, found in ellipses.items()}
+        self.evidence = ScaleEvidence(BoardFile((BOARD,)), seen_boards, ellipses)
         found = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in self.poses.values()])
         centres = np.stack([-pose[:3, :3].T @ pose[:3, 3] for pose in true])
         self.true_scale = np.cbrt(np.linalg.det(similarity(found, centres)[:3, :3]))

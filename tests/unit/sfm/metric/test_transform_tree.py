@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from targets import CAMERA
 
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
-from pipeprog_sfm.metric.gravity import STANDARD, GravityError, gravity
-from pipeprog_sfm.metric.metric_frame import Evidence, estimate_scale
+from pipeprog_sfm.metric.gravity import STANDARD_GRAVITY, GravityError, gravity
+from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
 from pipeprog_sfm.metric.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.metric.scale import NoScaleError
-from pipeprog_sfm.metric.transform_tree import Acceleration, NoPathError, Path, Transform, TransformTree
+from pipeprog_sfm.metric.transform_tree import Acceleration, CameraPath, NoPathError, Transform, TransformTree
 
 SECOND = 1_000_000_000
 PERFECT = OdometryConfig(scale_sigma=0.0)
@@ -85,7 +85,7 @@ class Robot:
         h = 1e-3
         felt = []
         for t in np.arange(0.0, self.seconds + 1e-9, 1 / rate):
-            force = (self.place(t + h) - 2 * self.place(t) + self.place(t - h)) / h**2 + [0, 0, STANDARD]
+            force = (self.place(t + h) - 2 * self.place(t) + self.place(t - h)) / h**2 + [0, 0, STANDARD_GRAVITY]
             turn = self.world_from_base(t)[:3, :3]
             felt.append(Acceleration(round(t * SECOND), "head", turn.T @ force + self.rng.normal(0, 0.05, 3)))
         return felt
@@ -174,9 +174,9 @@ def test_odometry_of_another_camera_is_refused():
     with pytest.raises(OdometryError, match="did not move together"):
         odometry_measurement(replace(path, fixed_from_camera=turned), robot.poses, PERFECT)
     with pytest.raises(OdometryError, match="stood still"):
-        odometry_measurement(Path("odom", path.stamps, np.tile(np.eye(4), (31, 1, 1))), robot.poses, PERFECT)
+        odometry_measurement(CameraPath("odom", path.stamps, np.tile(np.eye(4), (31, 1, 1))), robot.poses, PERFECT)
     with pytest.raises(OdometryError, match="1 of 31"):
-        odometry_measurement(Path("odom", path.stamps[:1], path.fixed_from_camera[:1]), robot.poses, PERFECT)
+        odometry_measurement(CameraPath("odom", path.stamps[:1], path.fixed_from_camera[:1]), robot.poses, PERFECT)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -194,7 +194,7 @@ def test_an_imu_that_counts_in_g_is_told():
     felt = robot.accelerations()
     stamps, forces = np.array([one.stamp for one in felt]), np.stack([one.force for one in felt])
     with pytest.raises(GravityError, match=r"feels 0\.9\d m/s"):
-        gravity(stamps, forces / STANDARD, robot.poses, 1 / robot.factor)
+        gravity(stamps, forces / STANDARD_GRAVITY, robot.poses, 1 / robot.factor)
     with pytest.raises(GravityError, match="do not cover"):
         gravity(stamps[:500], forces[:500], robot.poses, 1 / robot.factor)
 
@@ -202,7 +202,7 @@ def test_an_imu_that_counts_in_g_is_told():
 def test_odometry_alone_makes_a_metric_map_with_z_up():
     robot = Robot(4)
     estimate = estimate_scale(
-        Evidence(transforms=robot.tree(noise=0.002), accelerations=robot.accelerations(), camera_frame="camera"),
+        ScaleEvidence(transforms=robot.tree(noise=0.002), accelerations=robot.accelerations(), camera_frame="camera"),
         robot.poses,
         CAMERA,
         BoardConfig(),
@@ -223,4 +223,4 @@ def test_what_is_missing_is_told():
     tree = TransformTree()
     tree.add([Transform(0, "odom", "base", np.eye(4))])
     with pytest.raises(NoScaleError, match=r"nothing tells the scale.*no transform leads.*/tf_static"):
-        estimate_scale(Evidence(transforms=tree, camera_frame="camera"), robot.poses, CAMERA, BoardConfig())
+        estimate_scale(ScaleEvidence(transforms=tree, camera_frame="camera"), robot.poses, CAMERA, BoardConfig())
