@@ -63,7 +63,7 @@ def cloud(trials: int) -> None:
         # As in the detector, which fits what is left beside large planes.
         tree = tree.subset(~plane_segmentation.find_planes(tree, sigma, 1.5 * max(RADII))[1])
         free = np.ones(len(tree.points), bool)
-        middle = 0.5 * (truth.start + truth.end)
+        middle = truth.middle
         half = max(2.0 * radius, 0.05)
         direct = measure(
             tree, free, Hypothesis(Cylinder(middle - half * truth.axis, middle + half * truth.axis, radius), 0), sigma

@@ -20,7 +20,7 @@ from pipeprog_detect.silhouette.apparent_contour import viewing_direction
 from pipeprog_detect.silhouette.edge_support import own_outlines
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.thin.thin_pipes import find_lost
-from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
+from pipeprog_detect.types import Cloud, Pipe, View
 from pipeprog_detect.verification.keyframe_verifier import Jury
 from pipeprog_detect.verification.measured_pipe import Measured, joined
 from pipeprog_detect.verification.measurement_cache import Memory
@@ -84,11 +84,11 @@ def detect(
     radius_range = (config.radius_min, widest)
     planes = [replace(plane, point=plane.point - shift) for plane in parse_planes(config.plane)] if config.plane else []
     fresh = memory.novelty.of(points + shift)[tree.order] if memory else np.ones(len(tree.points), bool)
-    known = [_shifted(cylinder, -shift) for cylinder in memory.novelty.known] if memory else []
+    known = [cylinder.shifted(-shift) for cylinder in memory.novelty.known] if memory else []
     search = Search(tree, around, noise, radius_range, planned_radii, config, jury, report)
     candidates = search.candidates(fresh, known, planes)
     if memory:
-        memory.novelty.known = [_shifted(candidate.cylinder, shift) for candidate in candidates]
+        memory.novelty.known = [candidate.cylinder.shifted(shift) for candidate in candidates]
     report(0.9, "measuring in the keyframes" if views else "measuring")
     measured = jury.measure(candidates, [is_pipe(each, sigma if jury.sits else noise, config) for each in candidates])
     measured = _genuine(measured, around, judging)
@@ -128,10 +128,6 @@ def _abutted(measured: Sequence[Measured], around: Surroundings, views: Sequence
     return [one(number) for number in range(len(measured))]
 
 
-def _shifted(cylinder: Cylinder, by: FloatArray) -> Cylinder:
-    return Cylinder(cylinder.start + by, cylinder.end + by, cylinder.radius)
-
-
 def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
     """The pose for a map whose origin is moved to `shift` (3,)."""
     pose = camera_from_map.copy()
@@ -150,7 +146,7 @@ def _pipe(measured: Measured, bill: Bill, shift: FloatArray, concave: bool) -> P
     verdict = classification.classify(cylinder.radius, sigma, bill, concave)
     return Pipe(
         "",
-        _shifted(cylinder, shift),
+        cylinder.shifted(shift),
         sigma,
         verdict.name,
         verdict.probability,
@@ -162,7 +158,7 @@ def _pipe(measured: Measured, bill: Bill, shift: FloatArray, concave: bool) -> P
 
 def _numbered(pipes: list[Pipe]) -> list[Pipe]:
     """Pipes with ids p01, p02, ..., sorted by place so that the order of their discovery does not show."""
-    order = sorted(pipes, key=lambda pipe: tuple(np.round(0.5 * (pipe.cylinder.start + pipe.cylinder.end), 3)))
+    order = sorted(pipes, key=lambda pipe: tuple(np.round(pipe.cylinder.middle, 3)))
     width = max(2, len(str(len(order))))
     return [replace(pipe, id=f"p{number:0{width}d}") for number, pipe in enumerate(order, start=1)]
 

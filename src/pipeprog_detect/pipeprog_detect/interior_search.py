@@ -93,7 +93,7 @@ def is_concave_pipe(candidate: Candidate, sigma: float, config: DetectConfig) ->
 
 def _measured(tree: Octree, start: Cylinder, stretch: float, sigma: float, config: DetectConfig) -> Candidate | None:
     """The pipe that a nearly right cylinder is, as far as `stretch` radii either side; None where it is none."""
-    middle = 0.5 * (start.start + start.end)
+    middle = start.middle
     cylinder = start
     most = wide = _ROUGHNESS * (1.2 * sigma + 5e-4)
     # The band decides which points are fitted, and the fit what the band holds.
@@ -194,7 +194,7 @@ def _starts(tree: Octree, sigma: float, radius_range: tuple[float, float], confi
 
 def _same(one: Cylinder, other: Cylinder) -> bool:
     """Whether two cylinders are one within what measuring them mends."""
-    centres = np.stack([0.5 * (each.start + each.end) for each in (other, one)])
+    centres = np.stack([each.middle for each in (other, one)])
     axes, radii = np.stack([other.axis, one.axis]), np.array([other.radius, one.radius])
     return bool(_alike(centres, axes, radii, 0)[1])
 
@@ -234,9 +234,7 @@ def _through_pairs(
 
 def _densest(points: FloatArray, weight: FloatArray, cylinder: Cylinder, sigma: float) -> Cylinder:
     """The cylinder moved along its axis to where its surface, over its own length, has most points: seen best there."""
-    offset = points - cylinder.start
-    along = offset @ cylinder.axis
-    distance = np.linalg.norm(offset - along[:, None] * cylinder.axis, axis=1) - cylinder.radius
+    along, distance = cylinder.along(points), cylinder.surface_distance(points)
     near = (np.abs(distance) < 3.0 * sigma + 0.03 * cylinder.radius) & (np.abs(along) < 3.0 * cylinder.length)
     if not near.any():
         return cylinder

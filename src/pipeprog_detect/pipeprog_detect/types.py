@@ -33,6 +33,12 @@ class View:
     camera_from_map: FloatArray
     nearest: NDArray[np.float32] | None = None
 
+    @cached_property
+    def centre(self) -> FloatArray:
+        """The projection centre (3,) in the map frame [m]."""
+        rotation = self.camera_from_map[:3, :3]
+        return -rotation.T @ self.camera_from_map[:3, 3]
+
 
 @dataclass(frozen=True)
 class Cylinder:
@@ -52,11 +58,42 @@ class Cylinder:
         """Unit vector (3,) from start to end."""
         return (self.end - self.start) / self.length
 
+    @cached_property
+    def middle(self) -> FloatArray:
+        """The point (3,) of the axis halfway between the ends [m]."""
+        return 0.5 * (self.start + self.end)
+
+    def along(self, points: NDArray[np.floating]) -> FloatArray:
+        """Positions (N,) of points (N, 3) along the axis, from the start [m]."""
+        return np.asarray((points - self.start) @ self.axis)
+
+    def from_axis(self, points: NDArray[np.floating]) -> FloatArray:
+        """Vectors (N, 3) from the axis, endless, straight to points (N, 3) [m]."""
+        offset = points - self.start
+        return offset - (offset @ self.axis)[:, None] * self.axis
+
+    def surface_distance(self, points: NDArray[np.floating]) -> FloatArray:
+        """Signed distances (N,) of points (N, 3) from the endless surface, negative within [m]."""
+        return np.linalg.norm(self.from_axis(points), axis=1) - self.radius
+
     def contains(self, point: FloatArray) -> bool:
         """Whether a point (3,) lies within."""
         along = float((point - self.start) @ self.axis)
         off_axis = point - self.start - along * self.axis
         return 0.0 < along < self.length and float(off_axis @ off_axis) < self.radius**2
+
+    def cut(self, low: float, high: float) -> Cylinder:
+        """The part between two positions along the axis, from the start [m]; they may lie beyond the ends."""
+        return Cylinder(self.start + low * self.axis, self.start + high * self.axis, self.radius)
+
+    def cut_like(self, other: Cylinder) -> Cylinder:
+        """The part between the projections of another cylinder's ends on the axis."""
+        low, high = sorted(float((end - self.start) @ self.axis) for end in (other.start, other.end))
+        return self.cut(low, high)
+
+    def shifted(self, by: FloatArray) -> Cylinder:
+        """The cylinder moved by a vector (3,) [m]."""
+        return Cylinder(self.start + by, self.end + by, self.radius)
 
 
 @dataclass(frozen=True)

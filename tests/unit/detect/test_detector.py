@@ -81,7 +81,7 @@ def detected() -> tuple[Pipe, ...]:
 
 def match(truth: Cylinder, pipes: tuple[Pipe, ...]) -> Pipe:
     """The one pipe whose middle lies within the truth."""
-    middle = [0.5 * (pipe.cylinder.start + pipe.cylinder.end) for pipe in pipes]
+    middle = [pipe.cylinder.middle for pipe in pipes]
     along = [(point - truth.start) @ truth.axis for point in middle]
     off = [np.linalg.norm(p - truth.start - t * truth.axis) for p, t in zip(middle, along, strict=True)]
     near = [pipe for pipe, t, d in zip(pipes, along, off, strict=True) if 0 < t < truth.length and d < truth.radius]

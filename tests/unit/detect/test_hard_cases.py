@@ -65,7 +65,7 @@ def assert_all_found(scene: Scene, pipes: list[Pipe], length: float = 0.03) -> N
     """One pipe for each true one, in place, with its radius, class and length; no other."""
     left = list(pipes)
     for truth in scene.truth:
-        middle = 0.5 * (truth.start + truth.end)
+        middle = truth.middle
         match = [
             pipe
             for pipe in left

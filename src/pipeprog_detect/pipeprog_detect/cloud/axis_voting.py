@@ -133,8 +133,7 @@ def _sector(feet: FloatArray, cylinder: Cylinder) -> Sector | None:
     A patch that reaches into the cleft between two pipes fits no quadric and has no vote, so this sector is clear of
     neighbours: a touching one of the same size begins at 60 deg.
     """
-    offset = feet - cylinder.start
-    radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+    radial = cylinder.from_axis(feet)
     distance = np.linalg.norm(radial, axis=1)
     if np.median(distance) < 0.5 * cylinder.radius:
         return None

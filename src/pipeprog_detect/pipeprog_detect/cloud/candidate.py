@@ -90,14 +90,14 @@ def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma
                 return None
             low, high = runs[0].low, runs[-1].high
             grown = max(-low, high - cylinder.length)
-            cylinder = _cut(cylinder, low, high)
+            cylinder = cylinder.cut(low, high)
             points = _within(points, cylinder, Run(0.0, cylinder.length))
         facing = _spread_out(_facing(points, cylinder, hypothesis.sector), _FIT_POINTS)
         fit = fit_cylinder(facing, cylinder, wide, reach=reach, along_ray=False)
         if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
             return None
         wide = float(np.clip(1.2 * fit.rmse, 0.7 * sigma + 3e-4, 1.6 * sigma + 7e-4))
-        cylinder = fit.cylinder if turn == 0 else _between(fit.cylinder, cylinder)
+        cylinder = fit.cylinder if turn == 0 else fit.cylinder.cut_like(cylinder)
         if grown < 0.02 and turn >= 2:
             break
     margin = cylinder.radius * cylinder.axis
@@ -124,11 +124,11 @@ def settle(
     radius_sigma = float(np.linalg.norm([fit.radius_sigma, 0.5 * fit.rmse**2 / fit.cylinder.radius, _BENT_CLOUD]))
     if fit.rmse > _BLURRED * cylinder.radius:
         fit, radius_sigma = _by_width(body, cylinder, fit, wide)
-    cylinder = _between(fit.cylinder, cylinder)
+    cylinder = fit.cylinder.cut_like(cylinder)
     runs = _shown_runs(near, cylinder, wide) if whole else _seen_runs(near, cylinder, wide)
     if not runs:
         return None
-    cut = _cut(cylinder, runs[0].low, runs[-1].high)
+    cut = cylinder.cut(runs[0].low, runs[-1].high)
     runs = [Run(run.low - runs[0].low, run.high - runs[0].low) for run in runs]
     surface = _within(near, cut, Run(0.0, cut.length))
     surface = surface[np.abs(_signed_distance(surface, cut)) < 3.0 * wide]
@@ -168,7 +168,7 @@ def own_points(points: FloatArray, cylinder: Cylinder, others: Sequence[Cylinder
     mine = np.abs(_signed_distance(points, cylinder))
     keep = np.ones(len(points), bool)
     for other in others:
-        along = (points - other.start) @ other.axis
+        along = other.along(points)
         theirs = _signed_distance(points, other)
         # What lies within another barrel is its too: nothing passes through a pipe.
         keep &= ~((along > 0) & (along < other.length) & (theirs < mine))
@@ -183,9 +183,7 @@ def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: fl
     evenly on the surface; the noise across the ray, a third of that along it for a scanner, as much for a fused
     cloud, adds to that. Both are taken in between.
     """
-    axis = fit.cylinder.axis
-    offset = points - fit.cylinder.start
-    lateral = offset - (offset @ axis)[:, None] * axis
+    lateral = fit.cylinder.from_axis(points)
     near = lateral[np.linalg.norm(lateral, axis=1) < 2.0 * cylinder.radius + 2.0 * wide]
     if len(near) < 50:
         return fit, fit.cylinder.radius
@@ -239,8 +237,7 @@ def _roundness(points: FloatArray, cylinder: Cylinder, distance: FloatArray, sec
 def _facing(points: FloatArray, cylinder: Cylinder, sector: Sector | None) -> FloatArray:
     if sector is None:
         return points
-    offset = points - cylinder.start
-    radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+    radial = cylinder.from_axis(points)
     return points[radial @ sector.front > np.cos(sector.half) * np.linalg.norm(radial, axis=1)]
 
 
@@ -297,24 +294,13 @@ def _bridged(run: Run, gap: float, most: float, radius: float) -> bool:
     return gap < min(most, max(4.0 * run.length, radius))
 
 
-def _cut(cylinder: Cylinder, low: float, high: float) -> Cylinder:
-    return Cylinder(cylinder.start + low * cylinder.axis, cylinder.start + high * cylinder.axis, cylinder.radius)
-
-
-def _between(line: Cylinder, ends: Cylinder) -> Cylinder:
-    """The cylinder `line` with the ends of another one, projected."""
-    axis = line.axis
-    low, high = float((ends.start - line.start) @ axis), float((ends.end - line.start) @ axis)
-    return _cut(line, min(low, high), max(low, high))
-
-
 def _without_caps(cylinder: Cylinder, wide: float) -> Run:
     cap = min(5.0 * wide + 0.015, 0.2 * cylinder.length)
     return Run(cap, cylinder.length - cap)
 
 
 def _within(points: FloatArray, cylinder: Cylinder, run: Run) -> FloatArray:
-    along = (points - cylinder.start) @ cylinder.axis
+    along = cylinder.along(points)
     return points[(along >= run.low) & (along <= run.high)]
 
 

@@ -45,9 +45,8 @@ def spanning(pieces: Sequence[Cylinder], best: int) -> Cylinder:
     """One cylinder from end to end of collinear pieces, with the radius of the best; its axis joins the far ends."""
     if len(pieces) == 1:
         return pieces[0]
-    axis = pieces[best].axis
     ends = np.array([end for piece in pieces for end in (piece.start, piece.end)])
-    along = (ends - pieces[best].start) @ axis
+    along = pieces[best].along(ends)
     return Cylinder(ends[int(np.argmin(along))], ends[int(np.argmax(along))], pieces[best].radius)
 
 
@@ -91,6 +90,6 @@ def _axis_distance(one: Cylinder, other: Cylinder, steps: int = 9) -> float:
     best = np.inf
     for a, b in ((one, other), (other, one)):
         points: FloatArray = a.start + share * (a.end - a.start)
-        along = np.clip((points - b.start) @ b.axis, 0.0, b.length)
+        along = np.clip(b.along(points), 0.0, b.length)
         best = min(best, float(np.linalg.norm(points - b.start - along[:, None] * b.axis, axis=1).min()))
     return best

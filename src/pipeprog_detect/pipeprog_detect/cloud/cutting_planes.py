@@ -161,7 +161,7 @@ def _circle(
     axis, up to 10 deg, smears them.
     """
     axis, radius = section.axis, section.radius
-    centre = 0.5 * (section.start + section.end)
+    centre = section.middle
     reach = max(2.0 * radius, radius + 0.1)
     length = max(radius, 0.03) * axis
     rows = tree.near_segment(centre - length, centre + length, reach)

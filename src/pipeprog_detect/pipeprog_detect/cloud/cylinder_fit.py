@@ -78,7 +78,7 @@ def fit_cylinder(
     """
     if len(points) < 10 or not sigma > 0:
         return None
-    middle = 0.5 * (initial.start + initial.end)
+    middle = initial.middle
     radius = initial.radius if fixed_radius is None else fixed_radius
     free_radius = fixed_radius is None
     tensor = sigma**2 * np.eye(3)

@@ -35,7 +35,7 @@ def pipe_markers(pipes: Sequence[Pipe], bill: Bill) -> list[PipeMarker]:
     markers = []
     for pipe in pipes:
         cylinder = pipe.cylinder
-        centre = 0.5 * (cylinder.start + cylinder.end)
+        centre = cylinder.middle
         above = 0.5 * cylinder.length * abs(cylinder.axis[2]) + cylinder.radius + LABEL_GAP
         name = pipe.class_name or "unknown"
         markers.append(

@@ -41,12 +41,6 @@ class Stations:
         return Stations(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
 
-def camera_centre(view: View) -> FloatArray:
-    """The projection centre (3,) in the map frame [m]."""
-    rotation = view.camera_from_map[:3, :3]
-    return -rotation.T @ view.camera_from_map[:3, 3]
-
-
 def tangent_normals(point: FloatArray, axis: FloatArray, radius: float, centre: FloatArray) -> FloatArray | None:
     """Unit normals (2, 3) of the planes through `centre` that touch the cylinder; None where it lies inside.
 
@@ -80,8 +74,7 @@ def frame(cylinder: Cylinder, towards: FloatArray) -> FloatArray:
 
 def viewing_direction(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
     """Mean unit vector (3,) from the cameras to the cylinder's middle."""
-    middle = 0.5 * (cylinder.start + cylinder.end)
-    directions = [middle - camera_centre(view) for view in views]
+    directions = [cylinder.middle - view.centre for view in views]
     return np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
 
 
@@ -128,16 +121,15 @@ def stations(
     """
     axis, length = cylinder.axis, cylinder.length
     gains = []
-    middle = 0.5 * (cylinder.start + cylinder.end)
     for view in views:
-        distance = float(np.linalg.norm(camera_centre(view) - middle))
+        distance = float(np.linalg.norm(view.centre - cylinder.middle))
         gains.append(view.camera.fx / max(distance, 1e-3))
     step = spacing / float(np.median(gains))
     count = max(int(length / step), 4)
     fractions = (np.arange(count) + 0.5) / count
     parts: list[tuple[np.ndarray, ...]] = []
     for index, view in enumerate(views):
-        centre = camera_centre(view)
+        centre = view.centre
         normals = tangent_normals(cylinder.start, axis, cylinder.radius, centre)
         if normals is None:
             continue
@@ -193,12 +185,11 @@ def visible(
 ) -> NDArray[np.bool_]:
     """Mask (N,): stations that neither another cylinder, grown by `margin` pixels, nor the cloud hides from a view."""
     result = np.ones(len(at), bool)
-    middle = 0.5 * (cylinder.start + cylinder.end)
     for index, view in enumerate(views):
         chosen = np.flatnonzero(at.view == index)
         if len(chosen):
-            on_axis = middle + at.along[chosen, None] * cylinder.axis
-            depth = (on_axis - camera_centre(view)) @ view.camera_from_map[2, :3]
+            on_axis = cylinder.middle + at.along[chosen, None] * cylinder.axis
+            depth = (on_axis - view.centre) @ view.camera_from_map[2, :3]
             result[chosen] = ~hidden(view, at.pixel[chosen], depth, others, margin)
             result[chosen] &= ~behind(view, at.pixel[chosen], depth - cylinder.radius)
     return result
@@ -209,7 +200,7 @@ def hidden(
 ) -> NDArray[np.bool_]:
     """Which points (N,), seen at pixel (N, 2) at depth (N,) [m], lie behind a cylinder grown by `margin` pixels."""
     result = np.zeros(len(depth), bool)
-    camera, centre = view.camera, camera_centre(view)
+    camera, centre = view.camera, view.centre
     rays = np.stack(
         [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(depth))], axis=1
     )
@@ -242,7 +233,7 @@ def outline(cylinder: Cylinder, view: View) -> FloatArray:
 
     Raises ValueError where the camera stands inside the cylinder's infinite extension or a segment passes behind it.
     """
-    normals = tangent_normals(cylinder.start, cylinder.axis, cylinder.radius, camera_centre(view))
+    normals = tangent_normals(cylinder.start, cylinder.axis, cylinder.radius, view.centre)
     if normals is None:
         raise ValueError("the camera lies inside the cylinder: it has no outline")
     result = np.empty((2, 2, 2))

@@ -12,7 +12,6 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.apparent_contour import (
     Stations,
-    camera_centre,
     frame,
     moved,
     stations,
@@ -253,7 +252,7 @@ def _swung(
     swung = _fine(moved(longer, basis, steps[0]), scene, blur, held, np.zeros(5))
     if swung is None:
         return None
-    middle = 0.5 * (swung.cylinder.start + swung.cylinder.end)
+    middle = swung.cylinder.middle
     half = 0.5 * cylinder.length * swung.cylinder.axis
     return Cylinder(middle - half, middle + half, cylinder.radius)
 
@@ -286,8 +285,8 @@ def _fine(
 
 def _reach(cylinder: Cylinder, views: Sequence[View], pixels: float) -> float:
     """`pixels`, but less on a thin pipe, whose two outlines and highlight lie within a few pixels."""
-    middle = 0.5 * (cylinder.start + cylinder.end)
-    half_width = [view.camera.fx * cylinder.radius / np.linalg.norm(camera_centre(view) - middle) for view in views]
+    distance = [np.linalg.norm(view.centre - cylinder.middle) for view in views]
+    half_width = [view.camera.fx * cylinder.radius / each for view, each in zip(views, distance, strict=True)]
     return float(min(pixels, max(0.3 * np.median(half_width), 0.6)))
 
 
@@ -415,8 +414,7 @@ def _as_strip(at: Stations, cylinder: Cylinder, views: Sequence[View]) -> FloatA
 
     Seen from an angle off its normal a strip of half-width R looks R cos(angle) wide, a cylinder as wide as before.
     """
-    middle = 0.5 * (cylinder.start + cylinder.end)
-    towards = np.stack([camera_centre(view) - middle for view in views])
+    towards = np.stack([view.centre - cylinder.middle for view in views])
     towards = towards - np.outer(towards @ cylinder.axis, cylinder.axis)
     towards = towards / (np.linalg.norm(towards, axis=1)[:, None] + 1e-12)
     facing = towards[np.unique(at.view)].sum(axis=0)

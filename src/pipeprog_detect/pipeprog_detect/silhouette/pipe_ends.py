@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import camera_centre, hidden, project
+from pipeprog_detect.silhouette.apparent_contour import hidden, project
 from pipeprog_detect.silhouette.extension import Evidence, outline_evidence
 from pipeprog_detect.silhouette.limb_edges import LINEAR_LIGHT
 from pipeprog_detect.silhouette.occlusion import behind
@@ -79,7 +79,7 @@ def find_end(
     position, odds = _odds(evidence, inside)
     if not len(odds) or int(np.argmax(odds)) == len(odds) - 1:
         return None
-    distances = [np.linalg.norm(end - camera_centre(view)) for view in views]
+    distances = [np.linalg.norm(end - view.centre) for view in views]
     pixel = float(np.median(distances)) / views[0].camera.fx
     along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL, dtype=float)
     slopes = [_slopes(axis, end, cylinder.radius, along, view, others) for view in views]
@@ -127,7 +127,7 @@ def _slopes(
     axis: FloatArray, end: FloatArray, radius: float, along: FloatArray, view: View, others: Sequence[Cylinder]
 ) -> FloatArray:
     """Derivative of the light along the axis (SECTORS, T) on the unrolled barrel; NaN outside the image or hidden."""
-    towards = camera_centre(view) - end
+    towards = view.centre - end
     towards = towards - axis * (axis @ towards)
     towards = towards / np.linalg.norm(towards)
     angle = np.linspace(-HALF_ARC, HALF_ARC, SECTORS * RAYS_PER_SECTOR)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import camera_centre, inside
+from pipeprog_detect.silhouette.apparent_contour import inside
 from pipeprog_detect.types import Cylinder, View
 
 # The cloud beside a thin pipe is looked at as far as so many of its widths.
@@ -23,8 +23,7 @@ FOREMOST = 0.25
 
 def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
     """Mean projection centre (3,) of the views that show the cylinder's middle, None where none does."""
-    middle = 0.5 * (cylinder.start + cylinder.end)
-    centres = [camera_centre(view) for view in views if inside(view, middle[None])[0]]
+    centres = [view.centre for view in views if inside(view, cylinder.middle[None])[0]]
     return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
 
 

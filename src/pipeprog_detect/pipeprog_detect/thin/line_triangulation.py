@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import camera_centre, inside, project
+from pipeprog_detect.silhouette.apparent_contour import inside, project
 from pipeprog_detect.thin.depth_from_cloud import LAID_REACH, RELIEF_REACH, by_bin, covers, laid, robust_line, spanning
 from pipeprog_detect.thin.line_segments import Ribbons, ribbons, straight_edges
 from pipeprog_detect.types import Cylinder, View
@@ -110,7 +110,7 @@ def propose(
             found[covering[0]] = spanning(found[covering[0]], cylinder, centres[covering[0]])
         elif len(found) < limit:
             found.append(cylinder)
-            centres.append(np.mean([camera_centre(eyes[k].view) for k in np.flatnonzero(sees[:, best])], axis=0))
+            centres.append(np.mean([eyes[k].view.centre for k in np.flatnonzero(sees[:, best])], axis=0))
     if not found:
         return []
     found = [laid(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)]
@@ -127,8 +127,7 @@ def _few(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
     for view in views:
         depth = _seen_points(view, sparse)[1]
         if len(depth) and (
-            not chosen
-            or np.linalg.norm(camera_centre(view) - camera_centre(chosen[-1])) > STEP * float(np.median(depth))
+            not chosen or np.linalg.norm(view.centre - chosen[-1].centre) > STEP * float(np.median(depth))
         ):
             chosen.append(view)
     return chosen[:: -(-len(chosen) // MOST_VIEWS)] if chosen else []
@@ -375,7 +374,7 @@ def _adjusted(axes: _Axes, eyes: Sequence[_Eye], matched: Sequence[NDArray[np.in
     along = along / length[:, None]
     middle = axes.ends.mean(axis=1)
     weight = np.stack([_sees(axes, eye) for eye in eyes]).astype(float) + 1e-6
-    towards = middle - weight.T @ np.stack([camera_centre(eye.view) for eye in eyes]) / weight.sum(axis=0)[:, None]
+    towards = middle - weight.T @ np.stack([eye.view.centre for eye in eyes]) / weight.sum(axis=0)[:, None]
     depth = towards - along * np.einsum("ij,ij->i", along, towards)[:, None]
     depth = depth / (np.linalg.norm(depth, axis=1)[:, None] + 1e-12)
     basis = np.stack([np.cross(along, depth), depth], axis=1)

@@ -127,7 +127,7 @@ def aligned(
     Seen from one height alone, a level pipe may as well slope towards the cameras: what else runs there tells, as far
     as it differs by no more than the cylinder's own slope may be wrong, `slope_known_to` [rad].
     """
-    middle = 0.5 * (proposed.start + proposed.end)
+    middle = proposed.middle
     across = np.cross(proposed.axis, viewing_direction(proposed, views))
     across = across / np.linalg.norm(across)
     towards = np.cross(across, proposed.axis)
@@ -147,11 +147,8 @@ def aligned(
 def _seen(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:
     """The candidate that stands for a pipe found by its lines, with what the cloud (N, 3) holds of it."""
     cylinder = fit.cylinder
-    offset = points - cylinder.start
-    along = offset @ cylinder.axis
-    near = (along > 0) & (along < cylinder.length)
-    offset, along = offset[near], along[near]
-    distance = np.linalg.norm(offset - along[:, None] * cylinder.axis, axis=1) - cylinder.radius
+    along = cylinder.along(points)
+    distance = cylinder.surface_distance(points[(along > 0) & (along < cylinder.length)])
     distance = distance[np.abs(distance) < cylinder.radius]
     noise = float(np.sqrt(np.mean(distance**2))) if len(distance) else cylinder.radius
     evidence = Evidence(np.pi, fit.support, 0.0, noise, 0.0, 1.0)

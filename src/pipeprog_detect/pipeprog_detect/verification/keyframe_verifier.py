@@ -185,7 +185,7 @@ class Jury:
                 fit = refine(start, views, others, self._config, planned_radii, follow)
                 if fit is None or abs(fit.cylinder.radius / start.cylinder.radius - 1.0) < SETTLED:
                     break
-                start = replace(start, cylinder=_cut(fit.cylinder, cylinder))
+                start = replace(start, cylinder=fit.cylinder.cut_like(cylinder))
             if fit is not None:
                 fits.append(fit)
         best = max(fits, key=lambda fit: fit.support, default=None)
@@ -226,13 +226,7 @@ def _contradict(candidate: Candidate, fit: ContourFit) -> bool:
 def _by_the_cloud(candidate: Candidate, fit: ContourFit) -> tuple[Cylinder, float]:
     """The cloud's cylinder between the ends that the keyframes show, and the standard deviation of its radius [m]."""
     sigma = float(np.hypot(candidate.radius_sigma, candidate.evidence.noise))
-    return _cut(candidate.cylinder, fit.cylinder), sigma
-
-
-def _cut(line: Cylinder, ends: Cylinder) -> Cylinder:
-    """The cylinder `line` with the ends of another one, projected."""
-    low, high = sorted(float((end - line.start) @ line.axis) for end in (ends.start, ends.end))
-    return Cylinder(line.start + low * line.axis, line.start + high * line.axis, line.radius)
+    return candidate.cylinder.cut_like(fit.cylinder), sigma
 
 
 def _resolved(candidate: Candidate) -> bool:

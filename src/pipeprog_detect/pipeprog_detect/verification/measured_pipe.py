@@ -50,5 +50,4 @@ def is_stub(cylinder: Cylinder) -> bool:
 
 def is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
     """Whether the middle of the cylinder lies within a known one."""
-    middle = 0.5 * (cylinder.start + cylinder.end)
-    return any(other.contains(middle) for other in known)
+    return any(other.contains(cylinder.middle) for other in known)

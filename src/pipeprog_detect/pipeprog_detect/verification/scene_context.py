@@ -64,11 +64,10 @@ class Surroundings:
         if outwardness is not None and outwardness < _OUTWARD:
             return True
         cylinder = candidate.cylinder
-        middle = 0.5 * (cylinder.start + cylinder.end)
         allowed = _TANGENT * cylinder.radius + 3.0 * candidate.band
         feet = []
         for plane in self.planes:
-            away = plane.offset - float(plane.normal @ middle)
+            away = plane.offset - float(plane.normal @ cylinder.middle)
             if abs(plane.normal @ cylinder.axis) < _ALONG and abs(abs(away) - cylinder.radius) < allowed:
                 feet.append(np.sign(away) * plane.normal)
         corners = [one + other for k, one in enumerate(feet) for other in feet[:k] if abs(float(one @ other)) < _CORNER]
@@ -104,8 +103,7 @@ class Surroundings:
         """Rows of the points on the cylinder's surface and the unit vectors (K, 3) from its axis to them."""
         cylinder = candidate.cylinder
         rows = self.tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + 3.0 * candidate.band)
-        offset = self.tree.points[rows] - cylinder.start
-        radial = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
+        radial = cylinder.from_axis(self.tree.points[rows])
         distance = np.linalg.norm(radial, axis=1)
         near = np.abs(distance - cylinder.radius) < 3.0 * candidate.band
         return rows[near], radial[near] / (distance[near] + 1e-12)[:, None]

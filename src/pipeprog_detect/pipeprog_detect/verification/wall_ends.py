@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
-from pipeprog_detect.silhouette.apparent_contour import camera_centre, showing
+from pipeprog_detect.silhouette.apparent_contour import showing
 from pipeprog_detect.silhouette.extension import outline_evidence
 from pipeprog_detect.silhouette.limb_edges import SHARP
 from pipeprog_detect.types import Cylinder, View
@@ -76,7 +77,7 @@ def _distance(
         return None
     if distance < 0.0:
         before = float(plane.normal @ out)
-        seen_from = [before * float(plane.offset - plane.normal @ camera_centre(view)) for view in views]
+        seen_from = [before * float(plane.offset - plane.normal @ view.centre) for view in views]
         if min(seen_from, default=0.0) <= 0.0 or not _closed(offset, out, cylinder.radius):
             return None
     return distance
@@ -84,9 +85,8 @@ def _distance(
 
 def _closed(offset: FloatArray, axis: FloatArray, radius: float) -> bool:
     """Whether the points (N, 3), given from where the axis passes, lie close to the pipe on most of its sides."""
-    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    u = u / np.linalg.norm(u)
-    x, y = offset @ u, offset @ np.cross(axis, u)
+    u, v = basis(axis)
+    x, y = offset @ u, offset @ v
     close = np.hypot(x, y) < 4.0 * radius + 0.05
     sector = ((np.arctan2(y[close], x[close]) / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     return len(np.unique(sector)) >= CLOSED

@@ -51,7 +51,7 @@ def test_stations_touch_the_silhouette(x: float, z: float, tilt: float, turn: fl
     angle = np.linspace(0.0, 2 * np.pi, 720, endpoint=False)
     around = np.cos(angle)[:, None] * basis[0] + np.sin(angle)[:, None] * basis[1]
     for index in range(0, len(at), 9):
-        middle = 0.5 * (cylinder.start + cylinder.end)
+        middle = cylinder.middle
         reach = np.linspace(-0.02, 0.02, 9) + at.along[index]
         surface = middle + reach[:, None, None] * direction + radius * around
         pixel, _ = project(view, surface.reshape(-1, 3))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import camera_centre
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, SupportProfile, outline_support, own_outlines, support
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -16,8 +15,8 @@ BEHIND = 0.012  # [m]
 
 def ghost_of(pipe: Cylinder, views: list[View]) -> Cylinder:
     """What fills the pipe's silhouette from the views' mean centre, a little behind it."""
-    centre = np.mean([camera_centre(view) for view in views], axis=0)
-    grown = 1.0 + BEHIND / float(np.linalg.norm(0.5 * (pipe.start + pipe.end) - centre))
+    centre = np.mean([view.centre for view in views], axis=0)
+    grown = 1.0 + BEHIND / float(np.linalg.norm(pipe.middle - centre))
     return Cylinder(centre + grown * (pipe.start - centre), centre + grown * (pipe.end - centre), grown * pipe.radius)
 
 

@@ -45,7 +45,7 @@ def test_pieces_of_one_edge_are_joined_and_a_blank_image_has_none() -> None:
 def test_a_pipe_is_proposed_where_its_outlines_agree(pipe_views: list[View]) -> None:
     found = propose(pipe_views, cloud(PIPE), RADII, [], 5)
     assert found
-    offset = 0.5 * (found[0].start + found[0].end) - PIPE.start
+    offset = found[0].middle - PIPE.start
     assert np.linalg.norm(np.cross(offset, PIPE.axis)) < PIPE.radius
     assert abs(found[0].axis @ PIPE.axis) > np.cos(np.radians(5.0))
 
@@ -53,7 +53,7 @@ def test_a_pipe_is_proposed_where_its_outlines_agree(pipe_views: list[View]) -> 
 def test_known_pipes_and_strips_on_the_wall_are_not_proposed(pipe_views: list[View], empty_views: list[View]) -> None:
     wide = Cylinder(PIPE.start - 0.1 * PIPE.axis, PIPE.end + 0.1 * PIPE.axis, 1.5 * PIPE.radius)
     for cylinder in propose(pipe_views, cloud(PIPE), RADII, [wide], 5):
-        offset = 0.5 * (cylinder.start + cylinder.end) - PIPE.start
+        offset = cylinder.middle - PIPE.start
         assert np.linalg.norm(np.cross(offset, PIPE.axis)) > PIPE.radius
     assert propose(empty_views, cloud(), [SHADOW_RADIUS], [], 5) == []
     assert propose([], cloud(), RADII, [], 5) == []
