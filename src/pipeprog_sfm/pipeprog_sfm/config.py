@@ -4,84 +4,52 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from pipeprog_camera.setting import setting
+
 
 @dataclass(frozen=True)
 class MapperConfig:
-    """Features, matching and the streaming reconstruction."""
+    """Features, matching and the incremental reconstruction."""
 
-    max_features: int = field(
-        default=4000,
-        metadata={"description": "features extracted from one keyframe", "unit": "", "range": (200, 20000)},
-    )
+    max_features: int = setting(4000, "maximum number of features extracted from one keyframe", "", (200, 20000))
 
 
 @dataclass(frozen=True)
 class DeblurConfig:
-    """Motion blur, undone for the features of keyframes."""
+    """Motion blur, removed for the features of keyframes."""
 
-    exposure: float = field(
-        default=0.0,
-        metadata={
-            "description": "exposure time of an image; 0: not known, so that no motion blur is undone",
-            "unit": "s",
-            "range": (0.0, 1.0),
-        },
+    exposure: float = setting(
+        0.0, "exposure time of an image; 0: unknown, and motion blur is not removed", "s", (0.0, 1.0)
     )
-    min_length: float = field(
-        default=2.0,
-        metadata={
-            "description": "motion during the exposure from which on it is undone, as the median over the image",
-            "unit": "px",
-            "range": (0.5, 100.0),
-        },
+    min_length: float = setting(
+        2.0, "motion blur is removed where its median length over the image exceeds this", "px", (0.5, 100.0)
     )
 
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """Targets and scale."""
+    """Boards, scale bars and the scale."""
 
-    eccentricity: bool = field(
-        default=True,
-        metadata={"description": "correct circle centres for the eccentricity of their images", "unit": ""},
+    eccentricity: bool = setting(
+        True, "correct circle centres for perspective eccentricity (the centre of an ellipse is not the circle's)"
     )
-    min_radius: float = field(
-        default=4.0,
-        metadata={"description": "smallest image of a circle that is looked for", "unit": "px", "range": (3.0, 100.0)},
+    min_radius: float = setting(4.0, "minimum radius of a circle's image, semi-major axis", "px", (3.0, 100.0))
+    tolerance: float = setting(
+        0.00005, "standard deviation of a circle's position on the real board against its file", "m", (0.0, 0.01)
     )
-    tolerance: float = field(
-        default=0.00005,
-        metadata={
-            "description": "standard deviation of a circle's place on the real board against its file",
-            "unit": "m",
-            "range": (0.0, 0.01),
-        },
-    )
-    upright: bool = field(
-        default=True,
-        metadata={"description": "the board that is seen first hangs plumb: its y axis tells what is up", "unit": ""},
-    )
+    upright: bool = setting(True, "the first board seen hangs plumb: its y axis is the vertical")
 
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """Scale by what a robot knows of its motion and of its body."""
+    """Scale from a robot's odometry and from its camera rig."""
 
-    scale_sigma: float = field(
-        default=0.01,
-        metadata={
-            "description": "relative standard deviation of the lengths that odometry tells, as it is calibrated",
-            "unit": "",
-            "range": (0.0, 0.2),
-        },
-    )
-    baseline_sigma: float = field(
-        default=0.0005,
-        metadata={
-            "description": "standard deviation of the distance between two cameras on one body, as /tf_static tells it",
-            "unit": "m",
-            "range": (0.0, 0.1),
-        },
+    scale_sigma: float = setting(0.01, "relative standard deviation of odometry's lengths", "", (0.0, 0.2))
+    baseline_sigma: float = setting(
+        0.0005,
+        "standard deviation of the distance between two cameras of a rig, as given by /tf_static",
+        "m",
+        (0.0, 0.1),
     )
 
 
@@ -89,53 +57,26 @@ class OdometryConfig:
 class StereoConfig:
     """Depth maps."""
 
-    max_pairs: int = field(
-        default=4,
-        metadata={"description": "neighbours that each keyframe is matched with", "unit": "", "range": (1, 8)},
-    )
-    width: int = field(
-        default=1280,
-        metadata={
-            "description": "width at which images are matched, at most their own",
-            "unit": "px",
-            "range": (160, 4096),
-        },
-    )
+    max_pairs: int = setting(4, "neighbouring keyframes that each keyframe is matched with", "", (1, 8))
+    width: int = setting(1280, "image width used for matching; smaller images keep their own width", "px", (160, 4096))
 
 
 @dataclass(frozen=True)
 class FusionConfig:
     """The dense cloud."""
 
-    voxel: float = field(
-        default=0.004,
-        metadata={"description": "edge of a voxel, at most one point each", "unit": "m", "range": (0.0005, 0.1)},
-    )
-    min_views: int = field(
-        default=3,
-        metadata={"description": "depth maps that must agree on a point", "unit": "", "range": (1, 20)},
-    )
-    max_neighbours: int = field(
-        default=8,
-        metadata={"description": "depth maps that each new one is compared with", "unit": "", "range": (1, 64)},
-    )
-    max_maps: int = field(
-        default=400,
-        metadata={"description": "latest depth maps kept in memory for comparison", "unit": "", "range": (2, 100000)},
-    )
+    voxel: float = setting(0.004, "edge length of a voxel, which holds at most one point", "m", (0.0005, 0.1))
+    min_views: int = setting(3, "number of depth maps that must agree on a point", "", (1, 20))
+    max_neighbours: int = setting(8, "number of depth maps that each new one is compared with", "", (1, 64))
+    max_maps: int = setting(400, "number of recent depth maps kept in memory for comparison", "", (2, 100000))
 
 
 @dataclass(frozen=True)
 class SfmConfig:
     """All settings of the reconstruction."""
 
-    seed: int = field(
-        default=0, metadata={"description": "seed of every random choice", "unit": "", "range": (0, 2**31 - 1)}
-    )
-    map_interval: int = field(
-        default=5,
-        metadata={"description": "keyframes between two publications of the map", "unit": "", "range": (1, 1000)},
-    )
+    seed: int = setting(0, "seed of every random number generator", "", (0, 2**31 - 1))
+    map_interval: int = setting(5, "number of keyframes between two publications of the map", "", (1, 1000))
     mapper: MapperConfig = field(default_factory=MapperConfig)
     deblur: DeblurConfig = field(default_factory=DeblurConfig)
     board: BoardConfig = field(default_factory=BoardConfig)
