@@ -28,6 +28,7 @@ from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag, Frame
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_node import messages, qos
+from tests.schemas import faults_of_pipes
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG, BOQ, BOARD = (BAGS / f"demo.{end}" for end in ("mcap", "boq.yaml", "board.yaml"))
@@ -79,6 +80,7 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
     assert len(considered) == 16
 
     result = json.loads((one / "pipes.json").read_text())
+    assert faults_of_pipes(result) == []
     assert result.keys() == {"frame_id", "scale", "pipes", "classes", "runs"}
     assert result["frame_id"] == "map"
     assert result["scale"]["source"] == "board"
