@@ -11,7 +11,7 @@ from pathlib import Path
 prefix = Path(sys.prefix)
 
 # The sources come before their installed copies: an edit needs no rebuild.
-for package in sorted((prefix.parent / "src").glob("pipeprog_*"), reverse=True):
+for package in sorted((prefix.parent / "src").glob("pipeprog*"), reverse=True):
     if (package / package.name / "__init__.py").is_file():
         sys.path.insert(0, str(package))
 

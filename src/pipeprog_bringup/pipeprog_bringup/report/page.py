@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from pipeprog_bringup.report import plots, render
-from pipeprog_bringup.report.survey_reader import UNPLANNED, Survey, read_survey
+from pipeprog_bringup.report.survey_reader import Survey, read_survey
 from pipeprog_bringup.results.atomic_output import output_file
 from pipeprog_bringup.results.cloud_io import read_cloud
+from pipeprog_bringup.results.results_reader import UNPLANNED
 from pipeprog_camera.errors import InputError
 
 PICTURE_WIDTH = 1000

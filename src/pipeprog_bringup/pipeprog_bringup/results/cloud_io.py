@@ -29,8 +29,9 @@ class CloudFile:
     colors: NDArray[np.uint8] | None = None
 
 
-def read_cloud(path: Path) -> CloudFile:
+def read_cloud(path: str | Path) -> CloudFile:
     """Read .ply, .pcd, .las, .laz, .e57, .xyz, .txt, .csv, .pts; raises InputError where it holds no usable cloud."""
+    path = Path(path)
     if not path.is_file():
         raise InputError(f"no such cloud: {path}")
     reader = _READERS.get(path.suffix.lower())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -84,6 +85,22 @@ class Bill:
     """The planned classes, in the order of the file."""
 
     classes: tuple[PipeClass, ...]
+
+    @classmethod
+    def of_radii(cls, radii: Mapping[str, float]) -> Bill:
+        """Classes by their outer radii [m] alone: planned lengths are not known (nan).
+
+        Raises InputError where there is no class or a radius is no length.
+        """
+        where = Path("radii")
+        classes = [
+            PipeClass(name, radius, math.nan, (0.5, 0.5, 0.5), max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE))
+            for name, radius in radii.items()
+            if _positive(where, f"class '{name}'", "the outer radius in metres", radius)
+        ]
+        if not classes:
+            raise InputError("radii: no class is given: name at least one planned outer radius in metres")
+        return cls(_with_colors(where, classes, [{}] * len(classes)))
 
 
 def load_bill(path: str | Path) -> Bill:

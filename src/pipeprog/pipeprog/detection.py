@@ -1,0 +1,52 @@
+"""Pipes of a NumPy cloud: the detector's core with arrays in place of files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipeprog_detect import detector
+from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.types import Cloud, Pipe, View
+
+
+def detect(
+    points: ArrayLike,
+    radii: Sequence[float] | Mapping[str, float] | Bill,
+    views: Sequence[View] = (),
+    *,
+    normals: ArrayLike | None = None,
+    config: DetectConfig | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> list[Pipe]:
+    """Finds, measures and classifies the pipes of a metric cloud.
+
+    Args:
+        points: (N, 3) coordinates [m] in any frame; the pipes come back in the same one.
+        radii: planned outer radii [m]: a sequence (the classes are then named by it, such as "57.5 mm"), a mapping
+            from class names, or a bill of quantities as `load_bill` reads it.
+        views: keyframes of the same frame; where they are given, pipes are measured in them.
+        normals: (N, 3) unit normals towards the sensor, if known.
+        config: settings of the detector; the defaults of docs/parameters.md without.
+        progress: called with the share done (0 to 1) and what is being done.
+
+    Returns:
+        The pipes, sorted by place: `pipe.cylinder` holds start (3,), end (3,) and radius [m], `pipe.class_name` is
+        None where no planned class fits.
+
+    Raises:
+        InputError: no point is finite, the shapes do not fit, or a radius is no length.
+    """
+    cloud = Cloud(np.asarray(points, np.float64), None if normals is None else np.asarray(normals, np.float64))
+    bill = radii if isinstance(radii, Bill) else Bill.of_radii(_named(radii))
+    return detector.detect(cloud, bill, config or DetectConfig(), views, progress)
+
+
+def _named(radii: Sequence[float] | Mapping[str, float]) -> dict[str, float]:
+    """Radii [m] by class name."""
+    if isinstance(radii, Mapping):
+        return {str(name): float(radius) for name, radius in radii.items()}
+    return {f"{1e3 * float(radius):g} mm": float(radius) for radius in radii}

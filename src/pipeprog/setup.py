@@ -1,0 +1,19 @@
+from setuptools import find_packages, setup
+
+package_name = "pipeprog"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="pipeprog developers",
+    maintainer_email="maintainers@pipeprog.dev",
+    description="The Python interface of pipeprog, for notebooks and scripts without ROS.",
+    license="Apache-2.0",
+)
