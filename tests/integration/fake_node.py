@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -38,7 +38,7 @@ class FakeNode(Node):
         self._inputs: list[int] = []
         self._outputs = 0
         self._finish: tuple[int, Future] | None = None
-        self._infos = self._moved = 0
+        self._infos = 0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(0.2, self._report)
         self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
@@ -48,15 +48,7 @@ class FakeNode(Node):
             Path(os.environ["FAKE_PIDS"]).write_text(f"{os.getpid()} {child.pid}")
 
     def _report(self) -> None:
-        self._diagnostics.publish(
-            DiagnosticArray(
-                status=[
-                    DiagnosticStatus(
-                        name=f"{self._role}: fake", values=[KeyValue(key="motion", value=str(self._moved))]
-                    )
-                ]
-            )
-        )
+        self._diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(name=f"{self._role}: fake")]))
 
     def _be_frames(self) -> None:
         self._decisions = self.create_publisher(msg.FrameDecision, "frame_decisions", qos.reliable(1000))
@@ -73,6 +65,7 @@ class FakeNode(Node):
         self._points = self.create_publisher(PointCloud2, "map_points", qos.latched())
         self._poses = self.create_publisher(PathMsg, "keyframe_poses", qos.latched())
         self._statuses = self.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
+        self._status = msg.SfmStatus()
         self.create_subscription(CompressedImage, "keyframes/image/compressed", self._on_keyframe, qos.reliable(50))
         self.create_subscription(CameraInfo, "keyframes/camera_info", self._count_info, qos.reliable(50))
 
@@ -81,7 +74,8 @@ class FakeNode(Node):
         self.create_subscription(TFMessage, "/tf_static", self._on_motion, qos.kept(1000))
 
     def _on_motion(self, message: Odometry | Imu | TFMessage) -> None:
-        self._moved += len(message.transforms) if isinstance(message, TFMessage) else 1
+        self._status.motion_considered += len(message.transforms) if isinstance(message, TFMessage) else 1
+        self._statuses.publish(self._status)
 
     def _be_detect(self) -> None:
         self._pipes = self.create_publisher(msg.PipeArray, "pipes", qos.latched())
@@ -167,11 +161,9 @@ class FakeNode(Node):
         self._points.publish(messages.point_cloud(header, points, colors=np.zeros((1000, 3), np.uint8)))
         self._poses.publish(messages.path(header, stamps, np.tile(np.eye(4), (len(stamps), 1, 1))))
         self._outputs = 1
-        self._statuses.publish(
-            msg.SfmStatus(
-                header=header, keyframes_registered=len(stamps), map_revision=1, map_stamp=header.stamp, metric=True
-            )
-        )
+        self._status.header, self._status.map_stamp = header, header.stamp
+        self._status.keyframes_registered, self._status.map_revision, self._status.metric = len(stamps), 1, True
+        self._statuses.publish(self._status)
         return ""
 
 

@@ -25,7 +25,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pipeprog_bringup.recording import cdr
-from pipeprog_bringup.recording.bag import Bag, Frame
+from pipeprog_bringup.recording.bag import Bag, ImageMessage
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_node import messages, qos
 from tests.schemas import faults_of_pipes
@@ -142,7 +142,7 @@ class Robot:
         wanted |= {"keyframes/image/compressed": 2, "keyframes/camera_info": 2, "image_overlap": 1}
         return len(self.heard) == len(MODULES) and all(count(topic) >= number for topic, number in wanted.items())
 
-    def walk(self, frames: list[Frame]) -> None:
+    def walk(self, frames: list[ImageMessage]) -> None:
         """Ten frames a second."""
         for frame in frames:
             due = time.monotonic() + 0.1

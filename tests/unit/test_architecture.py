@@ -27,8 +27,8 @@ ALLOWED = {
 ALLOWED_IN_NODES = {"pipeprog_node", "pipeprog_msgs"}
 # The modules beside the cores' node.py that speak ROS.
 GLUE = {
-    "pipeprog_node": {"parameters", "qos", "diagnostics", "messages", "main", "worker"},
-    "pipeprog_bringup": {"replay", "session", "survey_writer", "node_processes"},
+    "pipeprog_node": {"parameters", "qos", "diagnostics", "discovery", "messages", "main", "worker"},
+    "pipeprog_bringup": {"replay", "session", "connections", "player", "listener", "survey_writer"},
 }
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
 # and all may import config.py and types.py.

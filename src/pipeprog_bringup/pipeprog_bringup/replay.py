@@ -14,7 +14,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph, NodeFailure, private_domain
-from pipeprog_bringup.playback.session import Passage, State
+from pipeprog_bringup.playback.session import Session, State
 from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, write_survey
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
@@ -80,14 +80,14 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     parameters["detect"] |= {"boq": str(request.boq.resolve()), "intermediate": False}
     with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
         parameters["sfm"]["colmap"] = str(folder.file("colmap").resolve())
-        run = Passage(bag, request.rate, report)
+        session = Session(bag, request.rate, report)
         with private_domain(scratch), Graph(parameters, scratch, modules) as graph, _ros():
-            survey, status = run.through(graph)
+            survey, status = session.run(graph)
         with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
             record_survey(recording, survey, status)
-            record_keyframes(recording, bag, run.log)
+            record_keyframes(recording, bag, session.log)
         started = time.monotonic()
-        pipes, classes = write_survey(folder, survey, run.log)
+        pipes, classes = write_survey(folder, survey, session.log)
         result_files.write_config(
             folder.file("config.yaml"),
             {
@@ -103,21 +103,21 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
                 },
             },
         )
-        losses = bag.losses + run.log.faults()
+        losses = bag.losses + session.log.faults()
         facts = {
             "command": "replay",
             "bag": str(request.bag.resolve()),
             "frames_in_bag": bag.image_count,
-            "frames_considered": run.log.considered,
-            "keyframes": run.log.chosen,
+            "frames_considered": session.log.considered,
+            "keyframes": session.log.chosen,
             "registered": status.keyframes_registered,
             "losses": losses,
             "seeds": {node: config.seed for node, config in configs.items() if hasattr(config, "seed")},
-            "timings_s": {**run.timings, "write": time.monotonic() - started},
+            "timings_s": {**session.timings, "write": time.monotonic() - started},
         }
         result_files.write_run(folder, facts)
     registered = status.keyframes_registered
-    return Outcome(pipes, classes, run.log.considered, run.log.chosen, registered, losses)
+    return Outcome(pipes, classes, session.log.considered, session.log.chosen, registered, losses)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 
 from pipeprog_bringup.playback.frame_log import FrameLog
-from pipeprog_bringup.playback.session import LastMessages, calibration
+from pipeprog_bringup.playback.listener import LastMessages
+from pipeprog_bringup.playback.player import calibration
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter

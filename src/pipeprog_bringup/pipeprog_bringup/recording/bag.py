@@ -21,7 +21,7 @@ _DEPTH_ENCODINGS = ("16UC1", "32FC1", "32FC2")
 
 
 @dataclass(frozen=True)
-class Frame:
+class ImageMessage:
     """One image of a recording: header stamp [ns], frame, serialised message, and the calibration in force."""
 
     stamp: int
@@ -31,7 +31,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionMessage:
     """One message of a robot's motion: the topic of pipeprog's graph that it belongs on, its type, its CDR bytes."""
 
     topic: str
@@ -92,24 +92,24 @@ class Bag:
         bag._check_size()
         return bag
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[ImageMessage]:
         """Stream the images; each carries the CameraInfo last recorded for its frame (the first one, before any)."""
-        return (message for message in self._stream(set()) if isinstance(message, Frame))
+        return (message for message in self._stream(set()) if isinstance(message, ImageMessage))
 
-    def with_motion(self) -> Iterator[Frame | Motion]:
+    def with_motion(self) -> Iterator[ImageMessage | MotionMessage]:
         """Stream the images and what odometry, TF and IMU tell between them; static transforms come first."""
         for topic in sorted(self.motion_topics):
             if self.motion_topics[topic] == TF_STATIC:
                 for message in _messages(self._files, {topic}):
-                    yield Motion(TF_STATIC, self._motion_types[topic], message.data)
+                    yield MotionMessage(TF_STATIC, self._motion_types[topic], message.data)
         yield from self._stream({topic for topic, target in self.motion_topics.items() if target != TF_STATIC})
 
-    def _stream(self, motion: set[str]) -> Iterator[Frame | Motion]:
+    def _stream(self, motion: set[str]) -> Iterator[ImageMessage | MotionMessage]:
         latest: dict[str, bytes] = {}
         newest = self._first_info
         for topic, message in _tagged(self._files, {self.image_topic, self.camera_info_topic, *motion}):
             if topic in motion:
-                yield Motion(self.motion_topics[topic], self._motion_types[topic], message.data)
+                yield MotionMessage(self.motion_topics[topic], self._motion_types[topic], message.data)
                 continue
             try:
                 stamp, frame_id = cdr.read_header(message.data)
@@ -117,12 +117,12 @@ class Bag:
                     cdr.read_camera_info(message.data)
             except ValueError:
                 if topic == self.image_topic:
-                    yield Frame(message.log_time, "", message.data, newest)
+                    yield ImageMessage(message.log_time, "", message.data, newest)
                 continue
             if topic == self.camera_info_topic:
                 newest = latest[frame_id] = message.data
             else:
-                yield Frame(stamp, frame_id, message.data, latest.get(frame_id, newest))
+                yield ImageMessage(stamp, frame_id, message.data, latest.get(frame_id, newest))
 
     @property
     def losses(self) -> list[str]:

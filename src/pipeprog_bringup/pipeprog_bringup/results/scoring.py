@@ -63,7 +63,7 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Alignment:
     """How the cameras fit the truth after alignment: `scale_error` relative, residuals [m]."""
 
     world_from_map: FloatArray
@@ -88,12 +88,12 @@ def score_files(pipes_json: Path, truth_json: Path) -> dict[str, Any]:
     return score(result, truth, trajectory)
 
 
-def aligned(trajectory_file: Path, truth_json: Path) -> Trajectory:
+def aligned(trajectory_file: Path, truth_json: Path) -> Alignment:
     """How a trajectory.tum, with the frames.csv beside it, lies on the truth's poses; raises InputError."""
     return align(*_pairs(trajectory_file, truth_json, read_truth(truth_json)))
 
 
-def score(result: Result, truth: Truth, trajectory: Trajectory | None = None) -> dict[str, Any]:
+def score(result: Result, truth: Truth, trajectory: Alignment | None = None) -> dict[str, Any]:
     """All figures as plain numbers, strings and lists; None where there is nothing to take a figure of.
 
     `detection` counts every detection; in `planned` only those with a class count, so a cylinder that was left without
@@ -156,7 +156,7 @@ def relation(detection: Segment, pipe: Segment) -> tuple[float, float, float]:
     return angle, distance, max(high - low, 0.0)
 
 
-def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Trajectory:
+def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Alignment:
     """Lay a trajectory onto the truth, poses (N, 4, 4) each.
 
     The rigid motion for the pipes is fitted to positions and directions together: on a straight walk the positions
@@ -172,7 +172,7 @@ def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Traject
     rigid_residuals = _residuals(positions, true_positions, _umeyama(positions, true_positions, scaled=False))
     world_from_map = _umeyama(positions, true_positions, scaled=True)
     residuals = _residuals(positions, true_positions, world_from_map)
-    return Trajectory(
+    return Alignment(
         world_from_map=_umeyama(corners, true_corners, scaled=False),
         poses=len(positions),
         scale_error=1 / float(np.cbrt(np.linalg.det(world_from_map[:3, :3]))) - 1,
@@ -338,7 +338,7 @@ def _length_figures(
     return {"mean_error_percent": float(np.mean(values)) if values else None, "per_class": per_class}
 
 
-def _trajectory_figures(trajectory: Trajectory) -> dict[str, Any]:
+def _trajectory_figures(trajectory: Alignment) -> dict[str, Any]:
     return {
         "poses": trajectory.poses,
         "rms_rigid_mm": 1e3 * trajectory.rms_rigid,

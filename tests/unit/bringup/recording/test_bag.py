@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
 from pipeprog_bringup.recording import cdr
-from pipeprog_bringup.recording.bag import Bag, Motion
+from pipeprog_bringup.recording.bag import Bag, MotionMessage
 from pipeprog_bringup.recording.bag_writer import BagWriter, message_definition
 from pipeprog_camera.errors import InputError
 from tests.unit.bringup.recordings import (
@@ -271,7 +271,7 @@ def motion_messages(odometries: list[str]) -> list[tuple[str, str, int, bytes]]:
 
 def test_motion_comes_between_the_frames_and_static_transforms_first(tmp_path: Path) -> None:
     bag = Bag.open(write_bag(tmp_path / "bag.mcap", motion_messages(["/odom"])))
-    told = [(one.topic, one.data) if isinstance(one, Motion) else one.stamp for one in bag.with_motion()]
+    told = [(one.topic, one.data) if isinstance(one, MotionMessage) else one.stamp for one in bag.with_motion()]
     assert told == [
         *(("/tf_static", b"mounted"), START, ("/tf", b"moving"), ("odometry", b"odometry")),
         *(START + STEP, START + 2 * STEP),

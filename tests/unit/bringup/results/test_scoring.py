@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipeprog_bringup.results.result_files import FrameRow, write_frames, write_trajectory
-from pipeprog_bringup.results.scoring import Result, Segment, Trajectory, Truth, align, read_result, score, score_files
+from pipeprog_bringup.results.scoring import Alignment, Result, Segment, Truth, align, read_result, score, score_files
 from pipeprog_camera.errors import InputError
 
 CLASSES = {"DN65": 0.0365, "DN100": 0.0575}
@@ -32,7 +32,7 @@ PERFECT = tuple(
 NO_POSES = np.empty((0, 4, 4))
 
 
-def scored(*pipes: Segment, ignore: tuple[Segment, ...] = (), trajectory: Trajectory | None = None) -> dict[str, Any]:
+def scored(*pipes: Segment, ignore: tuple[Segment, ...] = (), trajectory: Alignment | None = None) -> dict[str, Any]:
     return score(Result(pipes, CLASSES), Truth(TRUE_PIPES, ignore, NO_POSES), trajectory)
 
 

@@ -1,0 +1,103 @@
+"""What the nodes publish during a session: decisions, overlaps, status, diagnostics, and the last messages."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Path as PathMsg
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from pipeprog_bringup.playback.frame_log import FrameLog
+from pipeprog_bringup.playback.watchdog import Watchdog
+from pipeprog_bringup.results.result_files import FrameRow
+from pipeprog_msgs import msg
+from pipeprog_node import messages, qos
+
+_RESULTS = {"cloud": (PointCloud2, "map_points"), "poses": (PathMsg, "keyframe_poses")} | {
+    "pipes": (msg.PipeArray, "pipes"),
+    "markers": (MarkerArray, "pipe_markers"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class LastMessages:
+    """The last messages of the graph, all of one map."""
+
+    cloud: PointCloud2
+    poses: PathMsg
+    pipes: msg.PipeArray
+    markers: MarkerArray
+
+
+class Listener:
+    """Subscribes to what the nodes answer, writes it to `log` and tells `watchdog` that something moves.
+
+    `status` is the SfM's last, `answered` the number of keyframes that it has worked off.
+    """
+
+    def __init__(self, node: Node, log: FrameLog, watchdog: Watchdog) -> None:
+        self._node, self._log, self._watchdog = node, log, watchdog
+        self._results: dict[str, Any] = {}
+        self.status = msg.SfmStatus()
+        self.answered = 0
+        node.create_subscription(msg.FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
+        node.create_subscription(msg.ImageOverlapArray, "image_overlap", self._on_overlap, qos.kept(1000))
+        node.create_subscription(msg.SfmStatus, "sfm_status", self._on_status, qos.latched())
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def receive(self, *names: str) -> None:
+        """Subscribe to results that are complete (cloud, poses, pipes, markers): just the last message comes."""
+        for name in names:
+            kind, topic = _RESULTS[name]
+
+            def keep(message: Any, name: str = name) -> None:
+                self._results[name] = message
+
+            self._node.create_subscription(kind, topic, keep, qos.latched())
+
+    def results(self) -> LastMessages:
+        """The results that were received; `missing_results` must be empty."""
+        return LastMessages(**self._results)
+
+    def missing_results(self, revision: int) -> str:
+        """What lacks until all results are there and of the map `revision`; empty when nothing does."""
+        absent = [topic for name, (_, topic) in _RESULTS.items() if name not in self._results]
+        if absent:
+            return f"these results have not come: {', '.join(absent)}"
+        pipes = self._results["pipes"]
+        stamps = {name: self._results[name].header.stamp for name in ("cloud", "poses", "pipes")}
+        newest = min(self.status.map_revision, pipes.map_revision) >= revision
+        if newest and all(stamp == stamps["pipes"] for stamp in stamps.values()):
+            return ""
+        return "cloud, poses and pipes are not of one map; does another graph run in this ROS domain?"
+
+    def _on_decision(self, message: msg.FrameDecision) -> None:
+        self._watchdog.moved()
+        self._log.decide(
+            FrameRow(
+                messages.stamp_ns(message.header.stamp),
+                message.chosen,
+                message.reason,
+                overlap_predicted=message.overlap,
+                parallax=message.parallax,
+                sharpness=message.sharpness,
+            )
+        )
+
+    def _on_overlap(self, message: msg.ImageOverlapArray) -> None:
+        self._watchdog.moved()
+        self.answered = message.keyframes_considered
+        for image in message.images:
+            stamp = messages.stamp_ns(image.stamp)
+            self._log.overlap(stamp, image.overlap, image.cell_overlap, image.tie_points, image.registered)
+
+    def _on_status(self, message: msg.SfmStatus) -> None:
+        self.status = message
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._watchdog.heard(status.name.partition(":")[0])
