@@ -85,10 +85,10 @@ def replay(
         outcome = run(request, report)
     for loss in outcome.losses:
         _note(loss)
-    print_progress(outcome.pipes, outcome.classes)
+    print_progress(outcome.product)
     typer.echo(
         f"{outcome.frames} frames considered, {outcome.registered} of {outcome.keyframes} keyframes registered, "
-        f"{len(outcome.pipes)} pipes: {out / 'pipes.json'}"
+        f"{len(outcome.product.pipes)} pipes: {out / 'pipes.json'}"
     )
 
 
@@ -119,8 +119,8 @@ def detect(
         detection = detect_file(cloud, boq, out, [*cut, *(overrides or [])], force, report)
     if detection.dropped:
         _note(f"{detection.dropped} points of {cloud} are not finite and were left out")
-    print_progress(detection.pipes, detection.classes)
-    typer.echo(f"{len(detection.pipes)} pipes in {detection.points} points: {out / 'pipes.json'}")
+    print_progress(detection.product)
+    typer.echo(f"{len(detection.product.pipes)} pipes in {detection.points} points: {out / 'pipes.json'}")
 
 
 @app.command(rich_help_panel="To recordings")

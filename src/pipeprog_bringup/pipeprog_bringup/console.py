@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -13,8 +13,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from pipeprog_bringup.playback.session import State
-    from pipeprog_detect.product.classification import ClassProgress
-    from pipeprog_detect.types import Pipe
+    from pipeprog_detect.product.product import Product
 
 
 def output_console() -> Console:
@@ -64,17 +63,17 @@ def replay_bars() -> Iterator[Callable[[State], None]]:
         yield report
 
 
-def print_progress(pipes: Sequence[Pipe], classes: Sequence[ClassProgress]) -> None:
+def print_progress(product: Product) -> None:
     """Planned and installed metres of each class, and what belongs to none."""
     table = Table(title="Progress", title_justify="left")
     table.add_column("class")
     for name in ("outer radius [mm]", "pipes", "installed [m]", "planned [m]", "%"):
         table.add_column(name, justify="right")
-    for entry in classes:
-        count = sum(pipe.class_name == entry.name for pipe in pipes)
+    for entry in product.classes:
+        count = sum(pipe.class_name == entry.name for pipe in product.pipes)
         lengths = (f"{entry.installed:.2f}", f"{entry.planned:.2f}", f"{entry.percent:.1f}")
         table.add_row(entry.name, f"{1e3 * entry.outer_radius:.1f}", str(count), *lengths)
-    others = [pipe for pipe in pipes if pipe.class_name is None]
+    others = [pipe for pipe in product.pipes if pipe.class_name is None]
     if others:
         total = sum(pipe.cylinder.length for pipe in others)
         table.add_row("[dim]no planned class", "", str(len(others)), f"{total:.2f}", "", "")

@@ -14,8 +14,7 @@ from pipeprog_bringup.results.overrides import effective
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import Bill, load_bill
-from pipeprog_detect.product.classification import ClassProgress, progress
-from pipeprog_detect.types import Pipe
+from pipeprog_detect.product.product import Product, product_of
 
 # The file's own metres are the scale: none was measured, so nothing is added to the pipes' sigmas.
 SCALE = result_files.Scale("cloud", 0.0)
@@ -25,8 +24,7 @@ SCALE = result_files.Scale("cloud", 0.0)
 class Detection:
     """What was found in a cloud."""
 
-    pipes: list[Pipe]
-    classes: list[ClassProgress]
+    product: Product
     points: int
     dropped: int
 
@@ -49,7 +47,7 @@ def detect_file(
         read = time.time()
         pipes = detect(file.cloud, bill, config, (), report)
         timings = {"read": read - started, "detect": time.time() - read}
-        detection = Detection(pipes, progress(pipes, bill), len(file.cloud.points), file.dropped)
+        detection = Detection(product_of(pipes, bill), len(file.cloud.points), file.dropped)
         _write(folder, detection, cloud_path, bill, config, timings)
     return detection
 
@@ -62,8 +60,8 @@ def _write(
     config: DetectConfig,
     timings: dict[str, float],
 ) -> None:
-    result_files.write_pipes(folder.file("pipes.json"), detection.pipes, detection.classes, SCALE)
-    result_files.write_progress(folder.file("progress.csv"), detection.pipes, detection.classes)
+    result_files.write_pipes(folder.file("pipes.json"), detection.product, SCALE)
+    result_files.write_progress(folder.file("progress.csv"), detection.product)
     result_files.write_config(
         folder.file("config.yaml"), {"detect": dataclasses.asdict(config), "boq": result_files.bill_entries(bill)}
     )

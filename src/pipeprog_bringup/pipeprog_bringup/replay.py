@@ -23,8 +23,7 @@ from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_bill
-from pipeprog_detect.product.classification import ClassProgress
-from pipeprog_detect.types import Pipe
+from pipeprog_detect.product.product import Product
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
 
@@ -49,8 +48,7 @@ class Request:
 class Outcome:
     """What a replay has found."""
 
-    pipes: list[Pipe]
-    classes: list[ClassProgress]
+    product: Product
     frames: int
     keyframes: int
     registered: int
@@ -87,7 +85,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             record_survey(recording, survey, status)
             record_keyframes(recording, bag, session.log)
         started = time.monotonic()
-        pipes, classes = write_survey(folder, survey, session.log)
+        product = write_survey(folder, survey, session.log)
         result_files.write_config(
             folder.file("config.yaml"),
             {
@@ -117,7 +115,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
         }
         result_files.write_run(folder, facts)
     registered = status.keyframes_registered
-    return Outcome(pipes, classes, session.log.considered, session.log.chosen, registered, losses)
+    return Outcome(product, session.log.considered, session.log.chosen, registered, losses)
 
 
 @contextlib.contextmanager

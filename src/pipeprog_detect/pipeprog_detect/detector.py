@@ -138,7 +138,8 @@ def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
 def _product(measured: Sequence[Measured], bill: Bill, shift: FloatArray, config: DetectConfig) -> list[Pipe]:
     """The classified pipes in the frame that the cloud came in."""
     pipes = _numbered([_pipe(each, bill, shift, config.concave) for each in measured])
-    return classification.reclassified(pipes, bill, config.concave) if config.classifier == "kmeans" else pipes
+    pipes = classification.with_kmeans(pipes, bill)
+    return classification.named_by_kmeans(pipes, bill, config.concave) if config.classifier == "kmeans" else pipes
 
 
 def _pipe(measured: Measured, bill: Bill, shift: FloatArray, concave: bool) -> Pipe:

@@ -23,6 +23,7 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.product.boq import Bill, load_bill
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
+from pipeprog_detect.product.pipe_runs import PipeRun
 from pipeprog_detect.types import Pipe
 from pipeprog_detect.worker import Keyframe, Map, PipesReady, serve
 from pipeprog_msgs import msg, srv
@@ -52,6 +53,7 @@ class DetectNode(Node):
         self._parts: OrderedDict[int, dict[type, Any]] = OrderedDict()  # of maps, by stamp
         self._maps: dict[int, msg.SfmStatus] = {}  # handed to the worker, by revision
         self._received: set[int] = set()  # stamps of keyframes handed to the worker
+        self._uncalibrated: set[int] = set()  # stamps of keyframes whose CameraInfo is no calibration
         self._revision = self._pipes = 0
         self._finish: tuple[int, Future] | None = None
 
@@ -72,16 +74,24 @@ class DetectNode(Node):
         super().destroy_node()
 
     def _on_image(self, message: CompressedImage) -> None:
-        self._images[messages.stamp_ns(message.header.stamp)] = message
-        self._pair(messages.stamp_ns(message.header.stamp))
+        stamp = messages.stamp_ns(message.header.stamp)
+        self._images[stamp] = message
+        self._pair(stamp)
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         stamp = messages.stamp_ns(message.header.stamp)
-        self._cameras[stamp] = messages.camera_from_info(message)
+        try:
+            self._cameras[stamp] = messages.camera_from_info(message)
+        except InputError as error:
+            self.get_logger().error(f"a keyframe is left out: {error}", once=True)
+            self._uncalibrated.add(stamp)
         self._pair(stamp)
 
     def _pair(self, stamp: int) -> None:
-        if stamp in self._images and stamp in self._cameras:
+        if stamp in self._uncalibrated:
+            self._images.pop(stamp, None)
+            self._hand_over()
+        elif stamp in self._images and stamp in self._cameras:
             self._worker.send(Keyframe(stamp, bytes(self._images.pop(stamp).data), self._cameras.pop(stamp)))
             self._received.add(stamp)
             self._hand_over()
@@ -122,7 +132,7 @@ class DetectNode(Node):
             status = parts[msg.SfmStatus]
             final = self._finish is not None and status.map_revision >= self._finish[0]
             stamps, map_from_camera = messages.poses_from_path(parts[Path])
-            if (self._intermediate or final) and self._received.issuperset(stamps.tolist()):
+            if (self._intermediate or final) and self._uncalibrated.union(self._received).issuperset(stamps.tolist()):
                 points, normals = messages.points_from_cloud(parts[PointCloud2])
                 self._maps[status.map_revision] = status
                 self._worker.send(Map(status.map_revision, points, normals, stamps, map_from_camera, final))
@@ -135,19 +145,21 @@ class DetectNode(Node):
         for earlier in [revision for revision in self._maps if revision < event.revision]:
             del self._maps[earlier]  # skipped by the worker: a newer map had come
         header = messages.header(messages.stamp_ns(status.map_stamp), "map")
-        self._revision, self._pipes = event.revision, len(event.pipes)
+        product = event.product
+        self._revision, self._pipes = event.revision, len(product.pipes)
         self._array.publish(
             msg.PipeArray(
                 header=header,
                 map_revision=event.revision,
                 scale_source=status.scale_source,
                 scale_sigma=status.scale_sigma,
-                pipes=[_pipe_msg(pipe) for pipe in event.pipes],
-                classes=[_progress_msg(row, self._bill) for row in event.progress],
+                pipes=[_pipe_msg(pipe) for pipe in product.pipes],
+                classes=[_progress_msg(row, self._bill) for row in product.classes],
+                runs=[_run_msg(run) for run in product.runs],
             )
         )
         markers = [Marker(header=header, action=Marker.DELETEALL)]
-        for number, marker in enumerate(pipe_markers(event.pipes, self._bill)):
+        for number, marker in enumerate(pipe_markers(product.pipes, self._bill)):
             markers += _marker_msgs(number, marker, header)
         self._markers.publish(MarkerArray(markers=markers))
         self._finish_when_published()
@@ -157,7 +169,14 @@ class DetectNode(Node):
         raise SystemExit(1)
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
-        values = {"keyframes": len(self._received), "map revision": self._revision, "pipes": self._pipes}
+        values = {
+            "keyframes": len(self._received),
+            "keyframes without calibration": len(self._uncalibrated),
+            "map revision": self._revision,
+            "pipes": self._pipes,
+        }
+        if self._uncalibrated:
+            return DiagnosticStatus.WARN, "keyframes without a calibration are left out", values
         return DiagnosticStatus.OK, "detecting" if self._revision else "waiting for a map", values
 
 
@@ -170,9 +189,23 @@ def _pipe_msg(pipe: Pipe) -> msg.Pipe:
         radius_sigma=pipe.radius_sigma,
         class_name=pipe.class_name or "",
         class_probability=pipe.class_probability,
+        class_kmeans=pipe.class_kmeans,
         visible_arc=pipe.visible_arc,
         rmse=pipe.rmse,
         points=pipe.points,
+    )
+
+
+def _run_msg(run: PipeRun) -> msg.PipeRun:
+    return msg.PipeRun(
+        id=run.id,
+        pipes=list(run.pipes),
+        barrel_length=run.barrel,
+        centre_line_length=run.centre_line,
+        joints=[
+            msg.PipeJoint(kind=joint.kind, pipes=list(joint.pipes), angle=joint.angle, length=joint.length)
+            for joint in run.joints
+        ],
     )
 
 

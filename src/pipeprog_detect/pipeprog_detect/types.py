@@ -98,7 +98,10 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Pipe:
-    """A measured and classified pipe; fields as in pipeprog_msgs/Pipe (metres, radians)."""
+    """A measured and classified pipe; fields as in pipeprog_msgs/Pipe (metres, radians).
+
+    `class_kmeans` depends on the radii of all pipes of a map: it is empty until these are known.
+    """
 
     id: str
     cylinder: Cylinder
@@ -108,3 +111,4 @@ class Pipe:
     visible_arc: float
     rmse: float
     points: int
+    class_kmeans: str = ""

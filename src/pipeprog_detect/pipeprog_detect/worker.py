@@ -14,9 +14,9 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.product.boq import Bill
-from pipeprog_detect.product.classification import ClassProgress, progress
 from pipeprog_detect.product.pipe_tracker import Identities
-from pipeprog_detect.types import Cloud, Pipe
+from pipeprog_detect.product.product import Product, product_of
+from pipeprog_detect.types import Cloud
 from pipeprog_detect.verification.measurement_cache import Memory
 
 
@@ -46,11 +46,10 @@ class Map:
 
 @dataclass(frozen=True)
 class PipesReady:
-    """Event: the pipes of a map."""
+    """Event: the product of a map."""
 
     revision: int
-    pipes: list[Pipe]
-    progress: list[ClassProgress]
+    product: Product
 
 
 def serve(connection: Connection, config: DetectConfig, bill: Bill) -> None:
@@ -74,4 +73,4 @@ def serve(connection: Connection, config: DetectConfig, bill: Bill) -> None:
         if newest.final:
             memory.novelty = Novelty()
         pipes = identities.named(detect(cloud, bill, config, views, memory=memory))
-        connection.send(PipesReady(newest.revision, pipes, progress(pipes, bill)))
+        connection.send(PipesReady(newest.revision, product_of(pipes, bill)))

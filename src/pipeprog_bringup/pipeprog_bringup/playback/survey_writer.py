@@ -16,6 +16,8 @@ from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import write_las, write_ply
 from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.product.pipe_runs import Joint, PipeRun
+from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe
 from pipeprog_msgs import msg
 from pipeprog_node import messages
@@ -23,13 +25,12 @@ from pipeprog_node import messages
 _SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}
 
 
-def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> tuple[list[Pipe], list[ClassProgress]]:
+def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> Product:
     """pipes.json, progress.csv, cloud.ply, cloud.las, trajectory.tum, frames.csv; returns what the first two hold."""
-    pipes = [_pipe(pipe) for pipe in survey.pipes.pipes]
-    classes = [_progress(entry) for entry in survey.pipes.classes]
+    product = product_from_msg(survey.pipes)
     scale = result_files.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
-    result_files.write_pipes(folder.file("pipes.json"), pipes, classes, scale)
-    result_files.write_progress(folder.file("progress.csv"), pipes, classes)
+    result_files.write_pipes(folder.file("pipes.json"), product, scale)
+    result_files.write_progress(folder.file("progress.csv"), product)
     points, normals = messages.points_from_cloud(survey.cloud)
     colors = messages.colors_from_cloud(survey.cloud)
     write_ply(folder.file("cloud.ply"), points, colors, normals)
@@ -42,7 +43,7 @@ def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> t
         np.array([[p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w] for p in poses]),
     )
     result_files.write_frames(folder.file("frames.csv"), log.rows())
-    return pipes, classes
+    return product
 
 
 def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmStatus) -> None:
@@ -69,6 +70,15 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
         recording.write("/keyframes/image/compressed", cdr.COMPRESSED_IMAGE, data, frame.stamp)
 
 
+def product_from_msg(message: msg.PipeArray) -> Product:
+    """The product as the detector told it on `pipes`."""
+    return Product(
+        [_pipe(pipe) for pipe in message.pipes],
+        [_progress(entry) for entry in message.classes],
+        [_run(run) for run in message.runs],
+    )
+
+
 def _pipe(message: msg.Pipe) -> Pipe:
     start, end = (np.array([point.x, point.y, point.z]) for point in (message.start, message.end))
     return Pipe(
@@ -80,12 +90,18 @@ def _pipe(message: msg.Pipe) -> Pipe:
         message.visible_arc,
         message.rmse,
         message.points,
+        message.class_kmeans,
     )
 
 
 def _progress(message: msg.ClassProgress) -> ClassProgress:
     planned, installed = message.planned_length, message.installed_length
     return ClassProgress(message.class_name, message.outer_radius, planned, installed, 100 * installed / planned)
+
+
+def _run(message: msg.PipeRun) -> PipeRun:
+    joints = tuple(Joint(joint.kind, (*joint.pipes,), joint.angle, joint.length) for joint in message.joints)
+    return PipeRun(message.id, tuple(message.pipes), joints, message.barrel_length, message.centre_line_length)
 
 
 def _type_name(kind: type) -> str:

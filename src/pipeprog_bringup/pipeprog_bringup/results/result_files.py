@@ -21,8 +21,8 @@ from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import Bill
-from pipeprog_detect.product.classification import ClassProgress, by_kmeans
-from pipeprog_detect.product.pipe_runs import PipeRun, pipe_runs
+from pipeprog_detect.product.pipe_runs import PipeRun
+from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Pipe
 
 FRAME_COLUMNS = (
@@ -56,13 +56,11 @@ class FrameRow:
     tie_points: int | None = None
 
 
-def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress], scale: Scale) -> None:
+def write_pipes(path: Path, product: Product, scale: Scale) -> None:
     """pipes.json, one line a pipe; lengths rounded to the micrometre, far below what any measurement tells."""
     head = {"frame_id": "map", "scale": {"source": scale.source, "sigma": _significant(scale.sigma)}}
-    kmeans = by_kmeans([pipe.cylinder.radius for pipe in pipes], [entry.outer_radius for entry in classes])
-    runs = pipe_runs([pipe.cylinder for pipe in pipes])
     rows = {
-        "pipes": [_pipe_entry(pipe, classes[k].name) for pipe, k in zip(pipes, kmeans, strict=True)],
+        "pipes": [_pipe_entry(pipe) for pipe in product.pipes],
         "classes": [
             {
                 "class": entry.name,
@@ -71,9 +69,9 @@ def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgre
                 "installed_m": round(entry.installed, 6),
                 "percent": round(entry.percent, 2),
             }
-            for entry in classes
+            for entry in product.classes
         ],
-        "runs": [_run_entry(number, run, pipes) for number, run in enumerate(runs, start=1)],
+        "runs": [_run_entry(run) for run in product.runs],
     }
     parts = [json.dumps(head, allow_nan=False)[1:-1]]
     for name, entries in rows.items():
@@ -82,13 +80,13 @@ def write_pipes(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgre
     path.write_text("{" + ",\n ".join(parts) + "}\n")
 
 
-def write_progress(path: Path, pipes: Sequence[Pipe], classes: Sequence[ClassProgress]) -> None:
+def write_progress(path: Path, product: Product) -> None:
     """progress.csv: one line a class, for a spreadsheet."""
     with path.open("w", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes"])
-        for entry in classes:
-            count = sum(pipe.class_name == entry.name for pipe in pipes)
+        for entry in product.classes:
+            count = sum(pipe.class_name == entry.name for pipe in product.pipes)
             lengths = [f"{entry.planned:.3f}", f"{entry.installed:.3f}", f"{entry.percent:.1f}"]
             writer.writerow([entry.name, f"{1e3 * entry.outer_radius:.2f}", *lengths, count])
 
@@ -191,7 +189,7 @@ def _lines(path: Path) -> list[str]:
         raise InputError(f"{path} cannot be read: {error}") from None
 
 
-def _pipe_entry(pipe: Pipe, class_kmeans: str) -> dict[str, Any]:
+def _pipe_entry(pipe: Pipe) -> dict[str, Any]:
     return {
         "id": pipe.id,
         "start": [round(float(value), 6) for value in pipe.cylinder.start],
@@ -201,7 +199,7 @@ def _pipe_entry(pipe: Pipe, class_kmeans: str) -> dict[str, Any]:
         "length": round(pipe.cylinder.length, 6),
         "class": pipe.class_name,
         "class_probability": round(pipe.class_probability, 4),
-        "class_kmeans": class_kmeans,
+        "class_kmeans": pipe.class_kmeans,
         "ambiguous": pipe.class_name is None and pipe.class_probability > 0.0,
         "visible_arc_deg": round(float(np.degrees(pipe.visible_arc)), 1),
         "rmse": _significant(pipe.rmse),
@@ -209,16 +207,16 @@ def _pipe_entry(pipe: Pipe, class_kmeans: str) -> dict[str, Any]:
     }
 
 
-def _run_entry(number: int, run: PipeRun, pipes: Sequence[Pipe]) -> dict[str, Any]:
+def _run_entry(run: PipeRun) -> dict[str, Any]:
     return {
-        "id": f"r{number:02d}",
-        "pipes": [pipes[k].id for k in run.pipes],
+        "id": run.id,
+        "pipes": list(run.pipes),
         "barrel_length": round(run.barrel, 6),
         "centre_line_length": round(run.centre_line, 6),
         "joints": [
             {
                 "kind": joint.kind,
-                "pipes": [pipes[k].id for k in joint.pipes],
+                "pipes": list(joint.pipes),
                 "angle_deg": round(float(np.degrees(joint.angle)), 1),
                 "length": round(joint.length, 6),
             }

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.product.boq import Bill
@@ -15,6 +17,8 @@ from pipeprog_detect.types import Pipe
 _REJECT = 4.0
 # Under this probability the class is ambiguous, and none is named.
 SURE = 0.95
+# Steps of k-means; over radii of a site the labels settle in fewer than ten.
+_KMEANS_STEPS = 100
 
 
 @dataclass(frozen=True)
@@ -63,29 +67,37 @@ def by_kmeans(radii: Sequence[float], nominal: Sequence[float]) -> list[int]:
     """Number of the class of each pipe as the paper has it: k-means over radii [m] whose means start at the nominal.
 
     The means drift with what they gather and nothing is rejected, so a size that is not planned gets a class, too.
+    The mean of a class without pipes stays where it is; scikit-learn's KMeans would move it to the pipe that
+    is farthest from its own mean, and so give a class to it that none of its pipes has.
     """
-    values, means = np.asarray(radii, float), np.asarray(nominal, float)
-    if not len(values):
+    if not len(radii):
         return []
-    label = np.full(len(values), -1)
-    while True:
-        new = np.argmin(np.abs(values[:, None] - means), axis=1)
-        if (new == label).all():
-            return [int(number) for number in label]
-        label = new
-        means = np.array([values[label == k].mean() if (label == k).any() else means[k] for k in range(len(means))])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of classes without pipes: not all are built yet
+        _, labels = kmeans2(
+            np.asarray(radii, float), np.asarray(nominal, float), _KMEANS_STEPS, minit="matrix", missing="warn"
+        )
+    return [int(label) for label in labels]
 
 
-def reclassified(pipes: Sequence[Pipe], bill: Bill, concave: bool = False) -> list[Pipe]:
-    """The pipes with the classes that k-means gives them, each with its posterior probability."""
+def with_kmeans(pipes: Sequence[Pipe], bill: Bill) -> list[Pipe]:
+    """The pipes, each with the class that k-means over the radii of all gives it as its `class_kmeans`."""
     numbers = by_kmeans([pipe.cylinder.radius for pipe in pipes], [planned.outer_radius for planned in bill.classes])
+    return [replace(pipe, class_kmeans=bill.classes[number].name) for pipe, number in zip(pipes, numbers, strict=True)]
+
+
+def named_by_kmeans(pipes: Sequence[Pipe], bill: Bill, concave: bool = False) -> list[Pipe]:
+    """The pipes with their `class_kmeans` as their class, each with the posterior probability of that class."""
+    number = {planned.name: k for k, planned in enumerate(bill.classes)}
     return [
         replace(
             pipe,
-            class_name=bill.classes[number].name,
-            class_probability=float(_posterior(pipe.cylinder.radius, pipe.radius_sigma, bill, concave)[number]),
+            class_name=pipe.class_kmeans,
+            class_probability=float(
+                _posterior(pipe.cylinder.radius, pipe.radius_sigma, bill, concave)[number[pipe.class_kmeans]]
+            ),
         )
-        for pipe, number in zip(pipes, numbers, strict=True)
+        for pipe in pipes
     ]
 
 

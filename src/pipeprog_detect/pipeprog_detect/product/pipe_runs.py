@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.types import Cylinder
+from pipeprog_detect.types import Cylinder, Pipe
 
 # Axes that a fitting joins meet within this share of the radius, and what their measurement may be off by [m].
 _MISS, _LEAST_MISS = 0.3, 5e-3
@@ -24,64 +26,72 @@ _COUPLING, _LEAST_COUPLING = 10.0, 0.3
 
 @dataclass(frozen=True)
 class Joint:
-    """A fitting between the pipes with these numbers; angle [rad] of its turn, length [m] along the centre line.
+    """A fitting between the pipes with these ids; angle [rad] of its turn, length [m] along the centre line.
 
     kind is "elbow", "reducer", "coupling" or "tee"; of a tee the first pipe is the branch, whose centre line reaches
     the other's axis.
     """
 
     kind: str
-    pipes: tuple[int, int]
+    pipes: tuple[str, str]
     angle: float
     length: float
 
 
 @dataclass(frozen=True)
 class PipeRun:
-    """Connected pipes by number and their joints; lengths [m]: of the straight barrels, and of the centre line."""
+    """Connected pipes by id and their joints; lengths [m]: of the straight barrels, and of the centre line."""
 
-    pipes: tuple[int, ...]
+    id: str
+    pipes: tuple[str, ...]
     joints: tuple[Joint, ...]
     barrel: float
     centre_line: float
 
 
-def pipe_runs(cylinders: Sequence[Cylinder]) -> list[PipeRun]:
-    """The runs that the cylinders form, each cylinder in one of them, in the order of their first pipes."""
-    joints = find_joints(cylinders)
-    group = list(range(len(cylinders)))
-    for joint in joints:
-        old, new = max(group[k] for k in joint.pipes), min(group[k] for k in joint.pipes)
-        group = [new if member == old else member for member in group]
+def pipe_runs(pipes: Sequence[Pipe]) -> list[PipeRun]:
+    """The runs r01, r02, ... that the pipes form, each pipe in one of them, in the order of their first pipes."""
+    joints = find_joints(pipes)
+    number = {pipe.id: k for k, pipe in enumerate(pipes)}
+    rows = [[number[name] for name in joint.pipes] for joint in joints]
+    one, other = np.array(rows, int).reshape(-1, 2).T
+    connected = coo_array((np.ones(len(joints)), (one, other)), shape=(len(pipes), len(pipes)))
+    count, label = connected_components(connected, directed=False)
     runs = []
-    for first in sorted(set(group)):
-        pipes = tuple(k for k in range(len(cylinders)) if group[k] == first)
-        own = tuple(joint for joint in joints if group[joint.pipes[0]] == first)
-        barrel = sum(cylinders[k].length for k in pipes)
-        runs.append(PipeRun(pipes, own, barrel, barrel + sum(joint.length for joint in own)))
+    for run in range(count):
+        own = [pipe for pipe, its in zip(pipes, label, strict=True) if its == run]
+        fittings = tuple(joint for joint, row in zip(joints, rows, strict=True) if label[row[0]] == run)
+        barrel = sum(pipe.cylinder.length for pipe in own)
+        centre_line = barrel + sum(joint.length for joint in fittings)
+        runs.append(PipeRun(f"r{run + 1:02d}", tuple(pipe.id for pipe in own), fittings, barrel, centre_line))
     return runs
 
 
-def find_joints(cylinders: Sequence[Cylinder]) -> list[Joint]:
-    """The fittings between cylinders; each end has one at most, the one whose axes meet best."""
-    found: list[tuple[float, Joint, tuple[tuple[int, int], ...]]] = []
-    for i, j in combinations(range(len(cylinders)), 2):
+def find_joints(pipes: Sequence[Pipe]) -> list[Joint]:
+    """The fittings between pipes; each end of a pipe has one at most, the one whose axes meet best.
+
+    They are sorted by the places of their pipes in the list.
+    """
+    found: list[tuple[float, tuple[tuple[int, int], ...], tuple[int, int], Joint]] = []
+    for i, j in combinations(range(len(pipes)), 2):
         for a, b in product((0, 1), (0, 1)):
-            between = _between_ends(cylinders, i, j, a, b)
+            between = _between_ends(pipes[i], pipes[j], a, b)
             if between is not None:
-                found.append((*between, ((i, a), (j, b))))
-    for i, j in product(range(len(cylinders)), repeat=2):
+                miss, joint = between
+                found.append((miss, ((i, a), (j, b)), (i, j), joint))
+    for i, j in permutations(range(len(pipes)), 2):
         for a in (0, 1):
-            branch = _branch(cylinders, i, j, a) if i != j else None
+            branch = _branch(pipes[i], pipes[j], a)
             if branch is not None:
-                found.append((*branch, ((i, a),)))
-    joints: list[Joint] = []
+                miss, joint = branch
+                found.append((miss, ((i, a),), (i, j), joint))
+    joints: list[tuple[tuple[int, int], Joint]] = []
     used: set[tuple[int, int]] = set()
-    for _, joint, ends in sorted(found, key=lambda each: (each[0], each[2])):
+    for _, ends, places, joint in sorted(found, key=lambda each: each[:2]):
         if used.isdisjoint(ends):
             used.update(ends)
-            joints.append(joint)
-    return sorted(joints, key=lambda joint: joint.pipes)
+            joints.append((places, joint))
+    return [joint for _, joint in sorted(joints, key=lambda each: each[0])]
 
 
 def _end(cylinder: Cylinder, which: int) -> tuple[FloatArray, FloatArray]:
@@ -89,9 +99,10 @@ def _end(cylinder: Cylinder, which: int) -> tuple[FloatArray, FloatArray]:
     return (cylinder.start, -cylinder.axis) if which == 0 else (cylinder.end, cylinder.axis)
 
 
-def _between_ends(cylinders: Sequence[Cylinder], i: int, j: int, a: int, b: int) -> tuple[float, Joint] | None:
+def _between_ends(first: Pipe, second: Pipe, a: int, b: int) -> tuple[float, Joint] | None:
     """How ill the axes meet [m], and the elbow, reducer or coupling between two ends."""
-    one, other = cylinders[i], cylinders[j]
+    one, other = first.cylinder, second.cylinder
+    ids = (first.id, second.id)
     (from_, out), (to, back) = _end(one, a), _end(other, b)
     thick, thin = max(one.radius, other.radius), min(one.radius, other.radius)
     allowed = _MISS * thin + _LEAST_MISS
@@ -104,7 +115,7 @@ def _between_ends(cylinders: Sequence[Cylinder], i: int, j: int, a: int, b: int)
         if not -thick < along < max(_COUPLING * thick, _LEAST_COUPLING) or miss > allowed + 0.03 * abs(along):
             return None
         kind = "coupling" if thick < _SAME_SIZE * thin else "reducer"
-        return miss, Joint(kind, (i, j), turn, max(along, 0.0))
+        return miss, Joint(kind, ids, turn, max(along, 0.0))
     if turn > _SHARPEST or thick > _SAME_SIZE * thin:
         return None
     s, t, miss = _meeting(from_, out, to, back)
@@ -113,12 +124,12 @@ def _between_ends(cylinders: Sequence[Cylinder], i: int, j: int, a: int, b: int)
         return None
     # The bend begins where the nearer end is; what the other has more is straight socket.
     tangent = max(min(s, t), 0.0)
-    return miss, Joint("elbow", (i, j), turn, tangent * turn / float(np.tan(0.5 * turn)) + abs(s - t))
+    return miss, Joint("elbow", ids, turn, tangent * turn / float(np.tan(0.5 * turn)) + abs(s - t))
 
 
-def _branch(cylinders: Sequence[Cylinder], i: int, j: int, a: int) -> tuple[float, Joint] | None:
-    """How ill the axes meet [m], and the tee by which an end of pipe i branches off the barrel of pipe j."""
-    branch, run = cylinders[i], cylinders[j]
+def _branch(first: Pipe, second: Pipe, a: int) -> tuple[float, Joint] | None:
+    """How ill the axes meet [m], and the tee by which an end of the first pipe branches off the second's barrel."""
+    branch, run = first.cylinder, second.cylinder
     end, out = _end(branch, a)
     turn = float(np.arccos(np.clip(abs(out @ run.axis), 0.0, 1.0)))
     if turn < np.radians(30.0) or branch.radius > _SAME_SIZE * run.radius:
@@ -127,7 +138,7 @@ def _branch(cylinders: Sequence[Cylinder], i: int, j: int, a: int) -> tuple[floa
     reach = run.radius / float(np.sin(turn)) + _SOCKET * run.radius
     if miss > _MISS * run.radius + _LEAST_MISS or not 0.0 < s < reach or not run.radius < t < run.length - run.radius:
         return None
-    return miss, Joint("tee", (i, j), turn, s)
+    return miss, Joint("tee", (first.id, second.id), turn, s)
 
 
 def _meeting(one: FloatArray, out: FloatArray, other: FloatArray, back: FloatArray) -> tuple[float, float, float]:

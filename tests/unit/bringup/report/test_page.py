@@ -16,6 +16,7 @@ from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.cloud_io import write_ply
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe
 
 DAY = 86_400 * 10**9
@@ -34,7 +35,7 @@ def survey(folder: Path, day: int = 0, length: float = 2.0, name: str = "DN<200>
         Pipe("p02", cylinder(0.8), 0.0002, None, 0.0, 2.5, 0.001, 900),
     ]
     classes = [ClassProgress(name, 0.1, 4.0, length, 25 * length)]
-    result_files.write_pipes(folder / "pipes.json", pipes, classes, result_files.Scale("board", 0.0004))
+    result_files.write_pipes(folder / "pipes.json", Product(pipes, classes, []), result_files.Scale("board", 0.0004))
     wall = np.random.default_rng(0).uniform([-1, 0.15, -0.5], [2, 0.16, 2.5], (20_000, 3))
     write_ply(folder / "cloud.ply", wall, np.full((20_000, 3), 120, np.uint8))
     stamps = [START + day * DAY + i * 10**8 for i in range(5)]
@@ -119,7 +120,7 @@ def test_a_run_with_pipes_json_alone(tmp_path: Path) -> None:
 
 def test_a_run_without_pipes(tmp_path: Path) -> None:
     folder = survey(tmp_path / "run")
-    result_files.write_pipes(folder / "pipes.json", [], [], result_files.Scale("cloud", 0.0))
+    result_files.write_pipes(folder / "pipes.json", Product([], [], []), result_files.Scale("cloud", 0.0))
     _, text = read(report([folder], tmp_path / "report.html", False, silent))
     assert "as the cloud has it" in text
 

@@ -151,7 +151,7 @@ def test_an_interrupt_between_the_renames_waits_for_their_end(tmp_path: Path, mo
 def test_a_killed_run_leaves_no_final_name(tmp_path: Path) -> None:
     code = (
         "import sys, time, pathlib\n"
-        "from pipeprog_bringup.output import OutputFolder\n"
+        "from pipeprog_bringup.results.atomic_output import OutputFolder\n"
         "with OutputFolder(pathlib.Path(sys.argv[1])) as output:\n"
         "    output.file('pipes.json').write_text('{')\n"
         "    print('ready', flush=True)\n"

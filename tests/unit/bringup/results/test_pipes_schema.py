@@ -15,13 +15,18 @@ from jsonschema import Draft202012Validator
 
 from pipeprog_bringup.results import result_files
 from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.product.pipe_runs import pipe_runs
+from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe
 from tests.schemas import SCHEMA, faults_of_pipes
 
-UPRIGHT = Pipe("p01", Cylinder(np.zeros(3), np.array([0, 0, 1.0]), 0.05), 3e-4, "DN100", 0.99, 2.6, 1e-3, 20411)
+UPRIGHT = Pipe(
+    "p01", Cylinder(np.zeros(3), np.array([0, 0, 1.0]), 0.05), 3e-4, "DN100", 0.99, 2.6, 1e-3, 20411, "DN100"
+)
 LYING = replace(UPRIGHT, id="p02", cylinder=Cylinder(np.array([0, 0.1, 1.1]), np.array([0, 1.1, 1.1]), 0.05))
 ASIDE = Cylinder(np.array([3.0, 0, 0]), np.array([0, 3.0, 0]), 0.05)
 UNSURE = replace(UPRIGHT, id="p03", class_name=None, class_probability=0.6, cylinder=ASIDE)
+PIPES = [UPRIGHT, LYING, UNSURE]
 CLASSES = [ClassProgress("DN100", 0.05, 24.0, 2.0, 100 * 2 / 24)]
 
 
@@ -29,7 +34,7 @@ CLASSES = [ClassProgress("DN100", 0.05, 24.0, 2.0, 100 * 2 / 24)]
 def content(tmp_path: Path) -> Any:
     """A pipes.json with a run of two pipes and an elbow, and a pipe that two classes explain."""
     scale = result_files.Scale("board+odometry", None)
-    result_files.write_pipes(tmp_path / "pipes.json", [UPRIGHT, LYING, UNSURE], CLASSES, scale)
+    result_files.write_pipes(tmp_path / "pipes.json", Product(PIPES, CLASSES, pipe_runs(PIPES)), scale)
     return json.loads((tmp_path / "pipes.json").read_text())
 
 

@@ -14,8 +14,11 @@ from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.overrides import as_parameters, effective
+from pipeprog_bringup.results.result_files import Scale
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.product.pipe_runs import Joint, PipeRun
+from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe
 
 PIPE = Pipe(
@@ -27,13 +30,15 @@ PIPE = Pipe(
     2.6,
     0.0011,
     20411,
+    "DN125",
 )
-SCALE = result_files.Scale("board", 0.0004)
+SCALE = Scale("board", 0.0004)
 CLASSES = [ClassProgress("DN100", 0.0575, 24.0, 11.3, 100 * 11.3 / 24)]
+PRODUCT = Product([PIPE], CLASSES, [PipeRun("r01", ("p03",), (), 1.42, 1.42)])
 
 
 def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
-    result_files.write_pipes(tmp_path / "pipes.json", [PIPE], CLASSES, result_files.Scale("board", 0.0004))
+    result_files.write_pipes(tmp_path / "pipes.json", PRODUCT, SCALE)
     assert json.loads((tmp_path / "pipes.json").read_text()) == {
         "frame_id": "map",
         "scale": {"source": "board", "sigma": 0.0004},
@@ -47,7 +52,7 @@ def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
                 "length": 1.42,
                 "class": "DN100",
                 "class_probability": 0.99,
-                "class_kmeans": "DN100",
+                "class_kmeans": "DN125",
                 "ambiguous": False,
                 "visible_arc_deg": 149.0,
                 "rmse": 0.0011,
@@ -65,29 +70,35 @@ def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
 
 def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     pipe = Pipe("p01", PIPE.cylinder, float("nan"), None, 0.0, 2.6, 0.001, 3)
-    result_files.write_pipes(tmp_path / "pipes.json", [pipe], CLASSES, result_files.Scale("board", None))
+    result_files.write_pipes(tmp_path / "pipes.json", Product([pipe], CLASSES, []), Scale("board", None))
     content = json.loads((tmp_path / "pipes.json").read_text())
     assert content["pipes"][0]["class"] is content["pipes"][0]["radius_sigma"] is content["scale"]["sigma"] is None
 
 
-def test_what_two_classes_explain_is_ambiguous_and_runs_are_told(tmp_path: Path) -> None:
+def test_what_two_classes_explain_is_ambiguous(tmp_path: Path) -> None:
     unsure = replace(PIPE, class_name=None, class_probability=0.6)
-    beyond = Cylinder(PIPE.cylinder.end + np.array([0, 0.2, 0.2]), PIPE.cylinder.end + np.array([0, 1.2, 0.2]), 0.0575)
-    result_files.write_pipes(
-        tmp_path / "pipes.json", [unsure, replace(PIPE, id="p04", cylinder=beyond)], CLASSES, SCALE
-    )
+    result_files.write_pipes(tmp_path / "pipes.json", Product([unsure, PIPE], CLASSES, []), SCALE)
     content = json.loads((tmp_path / "pipes.json").read_text())
     assert [pipe["ambiguous"] for pipe in content["pipes"]] == [True, False]
-    assert [pipe["class_kmeans"] for pipe in content["pipes"]] == ["DN100", "DN100"]
-    (run,) = content["runs"]
-    assert run["pipes"] == ["p03", "p04"]
-    assert run["joints"][0]["kind"] == "elbow"
-    assert run["barrel_length"] == pytest.approx(2.42)
-    assert run["centre_line_length"] == pytest.approx(2.42 + 0.1 * np.pi)
+
+
+def test_runs_and_their_joints(tmp_path: Path) -> None:
+    elbow = Joint("elbow", ("p03", "p04"), 0.5 * np.pi, 0.31415926)
+    run = PipeRun("r07", ("p03", "p04"), (elbow,), 2.42, 2.73415926)
+    result_files.write_pipes(tmp_path / "pipes.json", Product([PIPE, replace(PIPE, id="p04")], CLASSES, [run]), SCALE)
+    assert json.loads((tmp_path / "pipes.json").read_text())["runs"] == [
+        {
+            "id": "r07",
+            "pipes": ["p03", "p04"],
+            "barrel_length": 2.42,
+            "centre_line_length": 2.734159,
+            "joints": [{"kind": "elbow", "pipes": ["p03", "p04"], "angle_deg": 90.0, "length": 0.314159}],
+        }
+    ]
 
 
 def test_progress_csv(tmp_path: Path) -> None:
-    result_files.write_progress(tmp_path / "progress.csv", [PIPE, PIPE], CLASSES)
+    result_files.write_progress(tmp_path / "progress.csv", Product([PIPE, PIPE], CLASSES, []))
     with (tmp_path / "progress.csv").open() as stream:
         row = next(csv.DictReader(stream))
     assert row == {

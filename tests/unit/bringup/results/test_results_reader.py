@@ -11,6 +11,7 @@ from pipeprog_bringup.results.cloud_io import write_ply
 from pipeprog_bringup.results.results_reader import read_results
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe
 
 PIPE = Pipe("p01", Cylinder(np.array([0.1, 0.2, 0.0]), np.array([0.1, 0.2, 1.5]), 0.0365), 2e-4, "DN65", 1, 2, 1e-3, 9)
@@ -19,7 +20,7 @@ PIPE = Pipe("p01", Cylinder(np.array([0.1, 0.2, 0.0]), np.array([0.1, 0.2, 1.5])
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     progress = [ClassProgress("DN65", 0.0365, 3.0, 1.5, 50.0)]
-    result_files.write_pipes(tmp_path / "pipes.json", [PIPE], progress, result_files.Scale("board", 4e-4))
+    result_files.write_pipes(tmp_path / "pipes.json", Product([PIPE], progress, []), result_files.Scale("board", 4e-4))
     result_files.write_trajectory(tmp_path / "trajectory.tum", [5], np.array([[1.0, 2, 3]]), np.array([[0, 0, 0, 1.0]]))
     rows = [result_files.FrameRow(5, True, "first frame", registered=True), result_files.FrameRow(6, False, "same")]
     result_files.write_frames(tmp_path / "frames.csv", rows)

@@ -6,9 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeprog_detect.product.boq import Bill, PipeClass
-from pipeprog_detect.product.classification import SURE, Verdict, by_kmeans, classify, progress
+from pipeprog_detect.product.classification import (
+    SURE,
+    Verdict,
+    by_kmeans,
+    classify,
+    named_by_kmeans,
+    progress,
+    with_kmeans,
+)
 from pipeprog_detect.types import Cylinder, Pipe
 
 
@@ -51,6 +61,38 @@ def test_kmeans_starts_at_the_planned_radii_and_names_everything() -> None:
     assert by_kmeans([], [0.0365]) == []
     # The means have moved to what they gathered: at the nominal radii 0.0505 would be the thicker one's.
     assert by_kmeans([0.045, 0.047, 0.0505, 0.070], [0.040, 0.060]) == [0, 0, 0, 1]
+
+
+def test_kmeans_leaves_classes_that_are_not_built_empty() -> None:
+    """Five planned classes, the second and fifth not built: no pipe of another class is moved into these."""
+    radii = [0.0200, 0.0399, 0.0401, 0.0500, 0.0502]
+    assert by_kmeans(radii, [0.020, 0.030, 0.040, 0.050, 0.060]) == [0, 2, 2, 3, 3]
+
+
+RADII = st.lists(st.floats(0.005, 0.2), min_size=1, max_size=20)
+
+
+@given(radii=RADII, nominal=RADII)
+def test_kmeans_settles(radii: list[float], nominal: list[float]) -> None:
+    """In the end no pipe is nearer to the mean of another class that has pipes than to that of its own."""
+    labels = np.array(by_kmeans(radii, nominal))
+    classes, own = np.unique(labels, return_inverse=True)
+    means = [np.mean(np.array(radii)[labels == k]) for k in classes]
+    gaps = np.abs(np.subtract.outer(radii, means))
+    assert gaps[np.arange(len(radii)), own] == pytest.approx(gaps.min(axis=1), abs=1e-9)
+
+
+def test_kmeans_as_the_classifier() -> None:
+    def pipe(radius: float) -> Pipe:
+        barrel = Cylinder(np.zeros(3), np.array([0.0, 0.0, 1.0]), radius)
+        return Pipe("p", barrel, 1e-4, "none of k-means's", 0.5, 2.0, 1e-3, 100)
+
+    found = with_kmeans([pipe(0.0365), pipe(0.0495)], PAPER)
+    assert [each.class_kmeans for each in found] == ["36.5", "57.5"]
+    named = named_by_kmeans(found, PAPER)
+    assert [each.class_name for each in named] == ["36.5", "57.5"]
+    assert named[0].class_probability > 0.99
+    assert named[1].class_probability == 0.0, "no class is near"
 
 
 @pytest.mark.parametrize("diameter_mm", [180, 195, 200, 340, 400])

@@ -8,11 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeprog_detect.product.pipe_runs import find_joints, pipe_runs
-from pipeprog_detect.types import Cylinder
+from pipeprog_detect.types import Cylinder, Pipe
 
 
 def cylinder(start: tuple[float, float, float], end: tuple[float, float, float], radius: float = 0.05) -> Cylinder:
     return Cylinder(np.array(start), np.array(end), radius)
+
+
+def pipes(*cylinders: Cylinder) -> list[Pipe]:
+    """Pipes a, b, ... of these cylinders."""
+    return [
+        Pipe(name, cylinder, 1e-4, None, 0.0, 3.0, 1e-3, 100)
+        for name, cylinder in zip("abcdefgh"[: len(cylinders)], cylinders, strict=True)
+    ]
 
 
 BEND = 0.15
@@ -21,8 +29,9 @@ UP = cylinder((1.0 + BEND, BEND, 0.0), (1.0 + BEND, 0.9, 0.0))
 
 
 def test_an_elbow_joins_two_pipes_and_its_arc_counts() -> None:
-    (run,) = pipe_runs([ALONG, UP])
-    assert [joint.kind for joint in run.joints] == ["elbow"]
+    (run,) = pipe_runs(pipes(ALONG, UP))
+    assert (run.id, run.pipes) == ("r01", ("a", "b"))
+    assert [(joint.kind, joint.pipes) for joint in run.joints] == [("elbow", ("a", "b"))]
     assert run.barrel == pytest.approx(1.0 + 0.9 - BEND)
     assert run.centre_line == pytest.approx(run.barrel + 0.5 * np.pi * BEND)
 
@@ -34,21 +43,21 @@ def test_elbows_of_any_turn(turn: float, bend: float, spin: float) -> None:
     aside = np.array([0.0, np.cos(spin), np.sin(spin)])
     out = np.cos(turn) * np.array([1.0, 0.0, 0.0]) + np.sin(turn) * aside
     corner = np.array([1.0 + tangent, 0.0, 0.0])
-    pipes = [
+    joined = [
         Cylinder(np.zeros(3), np.array([1.0, 0.0, 0.0]), radius),
         Cylinder(corner + tangent * out, corner + (tangent + 0.5) * out, radius),
     ]
-    (run,) = pipe_runs(pipes)
+    (run,) = pipe_runs(pipes(*joined))
     assert run.centre_line == pytest.approx(1.5 + bend * radius * turn, rel=1e-6)
-    turned = [Cylinder(pipe.end, pipe.start, pipe.radius) for pipe in reversed(pipes)]
-    assert pipe_runs(turned)[0].centre_line == pytest.approx(run.centre_line)
+    turned = [Cylinder(pipe.end, pipe.start, pipe.radius) for pipe in reversed(joined)]
+    assert pipe_runs(pipes(*turned))[0].centre_line == pytest.approx(run.centre_line)
 
 
 def test_a_tee_and_a_reducer() -> None:
     branch = cylinder((0.5, 0.06, 0.0), (0.5, 0.6, 0.0), 0.03)
     thinner = cylinder((1.12, 0.0, 0.0), (1.9, 0.0, 0.0), 0.03)
-    (run,) = pipe_runs([ALONG, branch, thinner])
-    assert [(joint.kind, joint.pipes) for joint in run.joints] == [("reducer", (0, 2)), ("tee", (1, 0))]
+    (run,) = pipe_runs(pipes(ALONG, branch, thinner))
+    assert [(joint.kind, joint.pipes) for joint in run.joints] == [("reducer", ("a", "c")), ("tee", ("b", "a"))]
     assert run.barrel == pytest.approx(1.0 + 0.54 + 0.78)
     assert run.centre_line == pytest.approx(run.barrel + 0.12 + 0.06)
 
@@ -66,13 +75,21 @@ def test_a_tee_and_a_reducer() -> None:
     ],
 )
 def test_pipes_that_are_not_connected(other: Cylinder) -> None:
-    assert find_joints([ALONG, other]) == []
-    assert [run.pipes for run in pipe_runs([ALONG, other])] == [(0,), (1,)]
+    assert find_joints(pipes(ALONG, other)) == []
+    assert [(run.id, run.pipes) for run in pipe_runs(pipes(ALONG, other))] == [("r01", ("a",)), ("r02", ("b",))]
 
 
 def test_an_end_has_one_fitting() -> None:
     other = cylinder((1.0 + BEND, -BEND, 0.0), (1.0 + BEND, -0.9, 0.001))
-    assert len([joint for joint in find_joints([ALONG, UP, other]) if 0 in joint.pipes]) == 1
+    assert len([joint for joint in find_joints(pipes(ALONG, UP, other)) if "a" in joint.pipes]) == 1
+
+
+def test_runs_are_in_the_order_of_their_first_pipes() -> None:
+    beyond = cylinder((1.0 + 2 * BEND, 0.9 + BEND, 0.0), (2.5, 0.9 + BEND, 0.0))
+    alone = cylinder((0.0, 3.0, 0.0), (1.0, 3.0, 0.0))
+    runs = pipe_runs(pipes(beyond, alone, ALONG, UP))
+    assert [run.pipes for run in runs] == [("a", "c", "d"), ("b",)]
+    assert [joint.pipes for joint in runs[0].joints] == [("a", "d"), ("c", "d")]
 
 
 def test_no_pipes_no_runs() -> None:

@@ -1,0 +1,250 @@
+"""The detector's node between keyframes, maps and those who read `pipes`; its worker is the real one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Path as Poses
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from pipeprog_bringup.playback.survey_writer import product_from_msg
+from pipeprog_bringup.results.result_files import Scale, write_pipes
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.config import ContourConfig, DetectConfig
+from pipeprog_detect.detector import detect
+from pipeprog_detect.node import DetectNode
+from pipeprog_detect.product.boq import load_bill
+from pipeprog_detect.product.product import Product, product_of
+from pipeprog_detect.types import Cloud
+from pipeprog_msgs import msg
+from pipeprog_msgs.srv import Finish
+from pipeprog_node import messages, qos
+
+CAMERA = Camera(640, 360, 450.0, 450.0, 319.5, 179.5)
+START = 1_700_000_000_000_000_000
+STEP = 200_000_000
+SETTINGS = ("-p", "contour.enabled:=false")  # the images of these tests show nothing
+JPEG = cv2.imencode(".jpg", np.full((360, 640), 128, np.uint8))[1].tobytes()
+BOQ = """classes:
+  - {name: DN100, outer_radius_mm: 57.5, planned_length_m: 4.0, color: "#ff0000"}
+  - {name: DN50, outer_radius_mm: 30.2, planned_length_m: 2.0}
+"""
+
+
+def corner() -> FloatArray:
+    """Points (N, 3) float32 of two pipes of 57.5 mm radius with an elbow between them, and of one of 40 mm."""
+    rng = np.random.default_rng(0)
+    barrels = []
+    for start, end, radius in (
+        ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 0.0575),
+        ([1.15, 0.0, 0.15], [1.15, 0.0, 0.9], 0.0575),
+        ([0.0, 0.0, 0.6], [0.8, 0.0, 0.6], 0.04),
+    ):
+        axis = np.subtract(end, start)
+        count = int(100_000 * radius * np.linalg.norm(axis))
+        front = np.array([0.0, -1.0, 0.0])
+        side = np.cross(front, axis / np.linalg.norm(axis))
+        angle = rng.uniform(-1.3, 1.3, (count, 1))
+        across = np.cos(angle) * front + np.sin(angle) * side
+        barrels.append(start + rng.uniform(0, 1, (count, 1)) * axis + rng.normal(radius, 5e-4, (count, 1)) * across)
+    return np.concatenate(barrels).astype(np.float32)
+
+
+class Stage:
+    """The node under test; what the selector and the SfM send it, and what it says."""
+
+    def __init__(self, boq: Path, *arguments: str) -> None:
+        self.boq = boq
+        boq.write_text(BOQ)
+        parameters = ("-p", f"boq:={boq}", *SETTINGS, *arguments)
+        rclpy.init(args=["--ros-args", "--log-level", "fatal", *parameters])
+        self.node = DetectNode()
+        self.others = Node("others")
+        self.pipes: list[msg.PipeArray] = []
+        self.markers: list[MarkerArray] = []
+        self.health: list[DiagnosticStatus] = []
+        self.others.create_subscription(msg.PipeArray, "pipes", self.pipes.append, qos.latched())
+        self.others.create_subscription(MarkerArray, "pipe_markers", self.markers.append, qos.latched())
+        self.others.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda message: self.health.extend(message.status), 10
+        )
+        publish = self.others.create_publisher
+        self._images = publish(CompressedImage, "keyframes/image/compressed", qos.reliable(50))
+        self._infos = publish(CameraInfo, "keyframes/camera_info", qos.reliable(50))
+        self._points = publish(PointCloud2, "map_points", qos.latched())
+        self._poses = publish(Poses, "keyframe_poses", qos.latched())
+        self._status = publish(msg.SfmStatus, "sfm_status", qos.latched())
+        self._executor = SingleThreadedExecutor()
+        for node in (self.node, self.others):
+            self._executor.add_node(node)
+        topics = (self._images, self._infos, self._points, self._poses, self._status)
+        self.spin_until(
+            lambda: (
+                all(topic.get_subscription_count() for topic in topics)
+                and self.others.count_publishers("pipes")
+                and self.others.count_publishers("pipe_markers")
+            )
+        )
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        for node in (self.node, self.others):
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+    def spin_until(self, condition: Callable[[], object], seconds: float = 60.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, "waited in vain"
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def send_image(self, stamp: int, encoded: bytes = JPEG) -> None:
+        self._images.publish(messages.compressed_image(stamp, "camera", encoded))
+
+    def send_calibration(self, stamp: int, focal_length: float = CAMERA.fx) -> None:
+        info = messages.info_from_camera(CAMERA, stamp, "camera")
+        info.k[0] = focal_length
+        self._infos.publish(info)
+
+    def send_map(self, stamp: int, revision: int, keyframes: list[int], points: FloatArray) -> None:
+        header = messages.header(stamp, "map")
+        self._points.publish(messages.point_cloud(header, points, np.zeros((len(points), 3), np.uint8)))
+        self._poses.publish(messages.path(header, np.array(keyframes), np.tile(np.eye(4), (len(keyframes), 1, 1))))
+        status = msg.SfmStatus(map_revision=revision, scale_source="board", scale_sigma=0.0004)
+        status.map_stamp = messages.time_msg(stamp)
+        self._status.publish(status)
+
+    def values(self) -> dict[str, str]:
+        """What the next diagnostics say, by key; the message under an empty one."""
+        self.health.clear()
+        self.spin_until(lambda: self.health)
+        status = self.health[-1]
+        return {"": status.message, **{pair.key: pair.value for pair in status.values}}
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Callable[..., Stage]]:
+    stages = []
+
+    def make(*arguments: str) -> Stage:
+        stages.append(Stage(tmp_path / "boq.yaml", *arguments))
+        return stages[-1]
+
+    yield make
+    for each in stages:
+        each.close()
+
+
+def test_what_a_robot_is_told_is_what_the_files_hold(stage: Callable[..., Stage], tmp_path: Path) -> None:
+    scene, points = stage(), corner()
+    scene.send_map(START, 7, [], points)
+    scene.spin_until(lambda: scene.pipes and scene.markers)
+    (message,) = scene.pipes
+    assert (message.header.frame_id, messages.stamp_ns(message.header.stamp)) == ("map", START)
+    assert (message.map_revision, message.scale_source, message.scale_sigma) == (7, "board", 0.0004)
+
+    bill = load_bill(scene.boq)
+    found = product_of(detect(Cloud(points.astype(float)), bill, DetectConfig(contour=ContourConfig(False))), bill)
+    assert len(found.pipes) == 3
+
+    def file(product: Product) -> str:
+        write_pipes(tmp_path / "pipes.json", product, Scale("board", 0.0004))
+        return (tmp_path / "pipes.json").read_text()
+
+    assert file(product_from_msg(message)) == file(found)
+    assert sorted(pipe.class_name for pipe in message.pipes) == ["", "DN100", "DN100"]
+    assert sorted(pipe.class_kmeans for pipe in message.pipes) == ["DN100", "DN100", "DN50"]
+    joined, alone = sorted(message.runs, key=lambda run: -len(run.pipes))
+    assert {run.id for run in message.runs} == {"r01", "r02"}
+    assert {pipe.id for pipe in message.pipes if pipe.class_name} == set(joined.pipes)
+    (joint,) = joined.joints
+    assert (joint.kind, set(joint.pipes)) == ("elbow", set(joined.pipes))
+    assert joint.angle == pytest.approx(np.pi / 2, abs=0.02)
+    assert joined.centre_line_length == pytest.approx(joined.barrel_length + joint.length)
+    assert (len(alone.pipes), alone.joints) == (1, [])
+    assert [row.class_name for row in message.classes] == ["DN100", "DN50"]
+    assert message.classes[0].color.r == 1.0
+
+    (markers,) = scene.markers
+    assert markers.markers[0].action == Marker.DELETEALL
+    assert len(markers.markers) == 1 + 2 * len(message.pipes)
+
+
+def test_a_map_waits_for_its_keyframes(stage: Callable[..., Stage]) -> None:
+    """Image and calibration of a keyframe come in either order, and after the map, too."""
+    scene, stamps = stage(), [START, START + STEP]
+    scene.send_map(START, 1, stamps, corner())
+    scene.send_image(stamps[0])
+    scene.send_calibration(stamps[1])
+    scene.send_image(stamps[1])
+    scene.spin_until(lambda: scene.values()["keyframes"] == "1")
+    assert scene.values()["map revision"] == "0"
+    scene.send_calibration(stamps[0])
+    scene.spin_until(lambda: scene.pipes)
+    assert scene.values()["keyframes"] == "2"
+    assert scene.values()["pipes"] == "3"
+
+
+def test_a_wrong_calibration_ends_no_node_and_stops_no_map(stage: Callable[..., Stage]) -> None:
+    scene, stamps = stage(), [START, START + STEP, START + 2 * STEP]
+    scene.send_calibration(stamps[0], focal_length=0.0)
+    scene.send_image(stamps[0])
+    scene.send_image(stamps[1])
+    scene.send_calibration(stamps[1], focal_length=float("nan"))
+    scene.spin_until(lambda: scene.values()["keyframes without calibration"] == "2")
+    assert "without a calibration" in scene.values()[""]
+    scene.send_image(stamps[2])
+    scene.send_calibration(stamps[2])
+    scene.send_map(START, 1, stamps, corner())
+    scene.spin_until(lambda: scene.pipes)
+    assert len(scene.pipes[0].pipes) == 3
+    assert scene.values()["keyframes"] == "1"
+
+
+def test_the_end_of_a_survey_waits_for_the_last_map(stage: Callable[..., Stage]) -> None:
+    """Without intermediate results only the map that `finish` names is worked off."""
+    scene = stage("-p", "intermediate:=false")
+    scene.send_map(START, 1, [], corner())
+    finish = scene.others.create_client(Finish, "detect/finish")
+    scene.spin_until(finish.service_is_ready)
+    end = finish.call_async(Finish.Request(expected_inputs=2))
+    scene.spin_until(lambda: scene.values()["map revision"] == "0")
+    assert not end.done()
+    scene.send_map(START + STEP, 2, [], corner())
+    scene.spin_until(end.done)
+    assert end.result().success
+    assert end.result().outputs == 2
+    scene.spin_until(lambda: scene.pipes)
+    assert [message.map_revision for message in scene.pipes] == [2]
+
+
+def test_the_node_ends_with_its_worker(stage: Callable[..., Stage]) -> None:
+    """Whoever launched it starts it again (tests/integration/test_restart.py); one that lives on detects nothing."""
+    scene = stage()
+    scene.send_image(START, b"no image")
+    scene.send_calibration(START)
+    scene.send_map(START, 1, [START], corner())
+    with pytest.raises(SystemExit) as end:
+        scene.spin_until(lambda: scene.pipes)
+    assert end.value.code == 1
+
+
+def test_without_a_bill_of_quantities_there_is_no_detector() -> None:
+    rclpy.init(args=["--ros-args", "--log-level", "fatal"])
+    try:
+        with pytest.raises(InputError, match="parameter boq"):
+            DetectNode()
+    finally:
+        rclpy.try_shutdown()
