@@ -37,7 +37,7 @@ def options(version: Annotated[bool, typer.Option("--version", help="Print the v
     if version:
         from importlib import metadata
 
-        typer.echo(f"pipeprog {metadata.version('pipeprog_bringup')}")
+        typer.echo(f"pipeprog {metadata.version('pipeprog')}")
         raise typer.Exit
 
 

@@ -25,7 +25,7 @@ from pipeprog_camera.errors import InputError
 NODE_MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"}
 _STOP_SECONDS = 3.0
 _PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None)
+_LIBC = ctypes.CDLL(None) if os.name == "posix" else None  # no graph runs elsewhere, but the command loads
 # Domains whose ports stay below the range that Linux hands out to other programs.
 _DOMAINS = range(1, 101)
 
@@ -142,6 +142,7 @@ class Graph:
 
 
 def _die_with_parent() -> None:
+    assert _LIBC is not None
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 

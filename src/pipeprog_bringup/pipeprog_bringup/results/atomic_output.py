@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import json
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -44,8 +44,7 @@ class OutputFolder:
             if not self._force and any(self.path.iterdir()):
                 raise InputError(f"{self.path} is not empty: choose another --out, or replace its results with --force")
             self._stage = Path(tempfile.mkdtemp(prefix=_STAGE_PREFIX, dir=self.path))
-            self._lock = os.open(self._stage, os.O_RDONLY)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock = _locked(self._stage)
             self._stage.joinpath(".probe").write_bytes(bytes(4096))
             self._stage.joinpath(".probe").unlink()
         except OSError as error:
@@ -88,23 +87,22 @@ class OutputFolder:
 
     def _remove_leftovers(self) -> None:
         """Remove what a killed run left; a run that still writes here holds its lock."""
+        if sys.platform == "win32":
+            return  # without locks the two are not told apart
         for stage in self.path.glob(f"{_STAGE_PREFIX}*"):
-            descriptor = os.open(stage, os.O_RDONLY)
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.close(_locked(stage))
             except BlockingIOError:
                 raise InputError(
                     f"another run is writing to {self.path}: wait for it, or choose another --out"
                 ) from None
-            finally:
-                os.close(descriptor)
             shutil.rmtree(stage)
 
     def _publish(self) -> None:
         """Move the new files to their names and remove those of the earlier run that have no successor."""
         names = self.names()
         for name in names:
-            with (self._stage / name).open("rb") as stream:
+            with (self._stage / name).open("rb+") as stream:
                 os.fsync(stream.fileno())
         stale = set(self._earlier_files()) - set(names)
         for name in names:
@@ -136,6 +134,26 @@ class OutputFolder:
             for folder in reversed(self._made):
                 with contextlib.suppress(OSError):
                     folder.rmdir()
+
+
+if sys.platform == "win32":
+
+    def _locked(folder: Path) -> int:
+        """-1: Windows locks no folders."""
+        return -1
+
+else:
+    import fcntl
+
+    def _locked(folder: Path) -> int:
+        """Descriptor that holds a folder locked until it is closed; BlockingIOError where another run holds it."""
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(descriptor)
+            raise
+        return descriptor
 
 
 @contextlib.contextmanager

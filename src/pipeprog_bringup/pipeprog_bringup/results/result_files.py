@@ -121,7 +121,7 @@ def write_config(path: Path, config: dict[str, Any]) -> None:
 def write_run(folder: OutputFolder, facts: dict[str, Any]) -> None:
     """run.json, the last file of a run: what ran, on what, for how long, with which versions, and what it wrote."""
     path = folder.file("run.json")
-    versions = {"python": platform.python_version(), "pipeprog": package_version("pipeprog_bringup")}
+    versions = {"python": platform.python_version(), "pipeprog": package_version("pipeprog")}
     versions.update({name: package_version(name) for name in _PACKAGES})
     names = sorted({*folder.names(), path.name})
     finished = datetime.now(timezone.utc).isoformat(timespec="seconds")
