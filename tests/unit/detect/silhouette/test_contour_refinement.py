@@ -15,8 +15,10 @@ from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
 UP = np.array([0.0, 0.0, 1.0])
-# One pixel is 3.5 mm here; the limb operator resolves a tenth of the blur.
+# One pixel is 3.5 mm here; the limb operator resolves a tenth of the blur, which is about one pixel.
 RADIUS_TOLERANCE = 0.35e-3
+# [m] The axis is as good across the view; along it by distance over half the baseline worse, 1.2 m / 0.45 m.
+AXIS_TOLERANCE = 0.35e-3 * 1.2 / 0.45
 CONFIG = ContourConfig()
 
 
@@ -39,7 +41,7 @@ def test_converges_from_every_start_beside_a_shadow(pipe_views: list[View]) -> N
         assert fit.views == len(pipe_views)
         for point in (fit.cylinder.start, fit.cylinder.end):
             across = np.cross(point - PIPE.start, PIPE.axis)
-            assert np.linalg.norm(across) < 3e-3
+            assert np.linalg.norm(across) < AXIS_TOLERANCE
 
 
 def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[View]) -> None:
@@ -54,7 +56,7 @@ def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[
     assert clean is not None
     assert fit is not None
     assert abs(fit.cylinder.radius - PIPE.radius) < 3.0 * fit.radius_sigma
-    assert abs(fit.cylinder.radius - PIPE.radius) < 2.0 * RADIUS_TOLERANCE
+    assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=RADIUS_TOLERANCE)
     assert np.trace(fit.covariance[:2, :2]) > 1.5 * np.trace(clean.covariance[:2, :2])
 
 
@@ -101,18 +103,24 @@ def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:
     screen = Cylinder(np.array([-0.5, -0.3, 0.0]), np.array([0.5, -0.3, 0.0]), 0.05)
     fit = refine(Start(PIPE, 0.002), pipe_views, [screen], CONFIG)
     assert fit is not None
-    assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=2.0 * RADIUS_TOLERANCE)
+    assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=RADIUS_TOLERANCE)
 
 
 @pytest.mark.parametrize("radius_known", [True, False])
-@pytest.mark.parametrize("aside", [0.0, 0.02, 0.05, 0.08])
-def test_what_is_thinner_than_its_edges_can_tell_is_measured_as_something_or_not_at_all(
-    empty_views: list[View], pipe_views: list[View], radius_known: bool, aside: float
+@pytest.mark.parametrize(("aside", "on_an_edge"), [(0.0, False), (0.02, False), (0.04, True), (0.05, None)])
+def test_no_radius_is_below_zero_where_edges_of_texture_pull_it(
+    empty_views: list[View], pipe_views: list[View], radius_known: bool, aside: float, on_an_edge: bool | None
 ) -> None:
-    """Edges of texture may pull a thin cylinder's radius below zero."""
+    """A cylinder thinner than a pixel is measured on the pipe's outline (0.04 m aside), and nowhere on plain texture.
+
+    At 0.05 m, between the outline and the shadow's edge, it may take either or none.
+    """
     place = np.array([aside, 0.0, 0.1])
     for views in (empty_views, pipe_views):
         for radius in (0.3e-3, 0.6e-3, 1e-3):
             thread = Cylinder(PIPE.start + place, PIPE.end + place - [0.0, 0.0, 0.2], radius)
             fit = refine(Start(thread, radius, radius_known, 0.03), views, [], ContourConfig(), [radius])
-            assert fit is None or fit.cylinder.radius > 0
+            if on_an_edge is not None:
+                assert (fit is not None) == (on_an_edge and views is pipe_views)
+            if fit is not None:
+                assert fit.cylinder.radius > 0

@@ -9,6 +9,7 @@ from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.thin.line_segments import ribbons, straight_edges
 from pipeprog_detect.thin.line_triangulation import propose
+from pipeprog_detect.thin.thin_pipes import FLAT, SURELY
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, WALL, front_points, wall_points
 
@@ -68,7 +69,9 @@ def test_outlines_of_a_strip_stay_where_they_are(pipe_views: list[View]) -> None
     at = np.array([SHADOW + SHADOW_RADIUS, WALL, 0.0])
     up = np.array([0.0, 0.0, 0.2])
     strip = refine(Start(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002), pipe_views, [PIPE], ContourConfig())
-    assert strip is None or strip.flatness - 0.5 > -strip.flatness_sigma
+    assert strip is not None
+    assert abs(strip.flatness - FLAT) < strip.flatness_sigma, "soft edges: the walk tells half of it"
+    assert strip.flatness - pipe.flatness > SURELY * np.hypot(strip.flatness_sigma, pipe.flatness_sigma)
 
 
 def test_a_known_slope_holds_what_one_height_leaves_open(pipe_views: list[View]) -> None:
