@@ -19,6 +19,8 @@ from sitegen.scan import scan
 from sitegen.site import CONCRETE, PIPE_MATERIALS
 
 NOISE = 1e-3
+# [m] Three times 0.2 mm, what a cloud's radius and axis are known to beside the noise that its many points average out.
+CLOUD_TOLERANCE = 0.6e-3
 THIN, MEDIUM, THICK = 0.0086, 0.0365, 0.0575
 BILL = Bill(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (THIN, MEDIUM, THICK, 0.0841)))
 STEEL = PIPE_MATERIALS[0]
@@ -61,22 +63,37 @@ def off_axis(point: FloatArray, line: Cylinder) -> float:
     return float(np.linalg.norm(offset - (offset @ line.axis) * line.axis))
 
 
-def assert_all_found(scene: Scene, pipes: list[Pipe], length: float = 0.03) -> None:
-    """One pipe for each true one, in place, with its radius, class and length; no other."""
+def free_end(radius: float) -> float:
+    """The surface's occupancy is counted in bins of 5 mm."""
+    return 5e-3
+
+
+def at_elbow(radius: float) -> float:
+    """A bend of three radii leaves the line by 5 mm, what a cloud's waviness allows, at this distance."""
+    return free_end(radius) + float(np.sqrt(6.0 * radius * 5e-3))
+
+
+def at_reducer(radius: float) -> float:
+    """A slice in which the section's centre is sought: where a cone begins in it, the slice is given up."""
+    return 5e-3 + 0.3 * radius
+
+
+def assert_all_found(scene: Scene, pipes: list[Pipe], tolerance: Callable[[float], float]) -> None:
+    """One pipe for each true one, in place, with its radius, class and length to `tolerance` [m]; no other."""
     left = list(pipes)
     for truth in scene.truth:
         middle = truth.middle
         match = [
             pipe
             for pipe in left
-            if abs(pipe.cylinder.axis @ truth.axis) > np.cos(np.radians(2.0))
-            and off_axis(middle, pipe.cylinder) < 0.3 * truth.radius + 2e-3
+            if off_axis(middle, pipe.cylinder) < CLOUD_TOLERANCE
+            and abs(pipe.cylinder.axis @ truth.axis) > np.cos(CLOUD_TOLERANCE / (0.5 * truth.length))
             and 0.0 < (middle - pipe.cylinder.start) @ pipe.cylinder.axis < pipe.cylinder.length
         ]
         assert len(match) == 1, truth
         left.remove(match[0])
-        assert match[0].cylinder.radius == pytest.approx(truth.radius, abs=1.5e-3 if truth.radius == THIN else 6e-4)
-        assert match[0].cylinder.length == pytest.approx(truth.length, rel=length)
+        assert match[0].cylinder.radius == pytest.approx(truth.radius, abs=CLOUD_TOLERANCE)
+        assert match[0].cylinder.length == pytest.approx(truth.length, abs=tolerance(truth.radius))
         assert match[0].class_name == f"{1e3 * truth.radius:g}"
     assert left == []
 
@@ -140,23 +157,17 @@ def through_a_reducer(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("build", "length"),
+    ("build", "tolerance"),
     [
-        (rack, 0.03),
-        (thin, 0.03),
-        (crossing, 0.03),
-        (along_a_wall, 0.03),
-        (behind_clamps, 0.03),
-        (sloping, 0.03),
-        (through_an_elbow, 0.06),
-        (through_a_tee, 0.08),
-        (through_a_reducer, 0.05),
+        *((build, free_end) for build in (rack, thin, crossing, along_a_wall, behind_clamps, sloping, through_a_tee)),
+        (through_an_elbow, at_elbow),
+        (through_a_reducer, at_reducer),
     ],
 )
-def test_pipes_that_are_hard_to_find(build: Callable[[Scene], None], length: float) -> None:
+def test_pipes_that_are_hard_to_find(build: Callable[[Scene], None], tolerance: Callable[[float], float]) -> None:
     scene = Scene()
     build(scene)
-    assert_all_found(scene, found(scene.cloud()), length)
+    assert_all_found(scene, found(scene.cloud()), tolerance)
 
 
 def duct(scene: Scene) -> None:
