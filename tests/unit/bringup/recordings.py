@@ -35,13 +35,8 @@ def info(number: int, camera: Camera = CAMERA, frame_id: str = "camera") -> byte
 
 def raw_image(number: int, encoding: str = "mono8") -> bytes:
     """CDR bytes of a raw sensor_msgs/Image."""
-    writer = cdr._Writer()
-    writer.header(START + number * STEP, "camera")
-    writer.numbers("I", 48, 64)
-    writer.string(encoding)
-    writer.numbers("B", 0)
-    writer.numbers("I", 64, 64 * 48)
-    return bytes(writer.data) + bytes(64 * 48)
+    content = {"header": cdr.header(START + number * STEP, "camera"), "height": 48, "width": 64, "step": 64}
+    return cdr.write(cdr.IMAGE, {**content, "encoding": encoding, "data": bytes(64 * 48)})
 
 
 def mcap_bytes(

@@ -1,16 +1,22 @@
-"""The camera's three messages as CDR bytes: headers, image sizes and CameraInfo without a ROS installation.
+"""The camera's messages as CDR bytes, without rclpy: read by hand, written by mcap_ros2.
 
-Layout: OMG CDR (XCDR1), a four-byte encapsulation header, every number aligned to its size counted from behind that
-header; the message definitions are those of sensor_msgs in ROS 2 Jazzy.
+Reading needs the first fields only (a stamp, a size), must survive damaged messages, and recordings may lack the
+definitions that a general decoder needs. Layout: OMG CDR (XCDR1), a four-byte encapsulation header, every number
+aligned to its size counted from behind that header; the definitions are those of sensor_msgs in ROS 2 Jazzy.
 """
 
 from __future__ import annotations
 
+import functools
 import struct
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from mcap_ros2.writer import serialize_dynamic
 
+from pipeprog_bringup.recording.definitions import message_definition
 from pipeprog_camera.camera import Camera
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -69,28 +75,6 @@ class _Reader:
     def header(self) -> tuple[int, str]:
         seconds, nanoseconds = self.number("i"), self.number("I")
         return seconds * NANOSECONDS + nanoseconds, self.string()
-
-
-class _Writer:
-    """Writes one little-endian message."""
-
-    def __init__(self) -> None:
-        self.data = bytearray(b"\x00\x01\x00\x00")
-
-    def numbers(self, kind: str, *values: float) -> None:
-        size = struct.calcsize(kind)
-        self.data += bytes((4 - len(self.data)) % size)
-        self.data += struct.pack(f"<{len(values)}{kind}", *values)
-
-    def string(self, text: str) -> None:
-        encoded = text.encode() + b"\0"
-        self.numbers("I", len(encoded))
-        self.data += encoded
-
-    def header(self, stamp: int, frame_id: str) -> None:
-        self.numbers("i", stamp // NANOSECONDS)
-        self.numbers("I", stamp % NANOSECONDS)
-        self.string(frame_id)
 
 
 def read_header(data: bytes) -> tuple[int, str]:
@@ -162,24 +146,36 @@ def is_whole(data: bytes, type_name: str) -> bool:
     return len(data) >= reader.position + length
 
 
+def write(type_name: str, content: Mapping[str, Any]) -> bytes:
+    """CDR bytes of a message of the type `package/msg/Name`; fields that `content` lacks have their defaults."""
+    return _encoder(type_name)(content)
+
+
+def header(stamp: int, frame_id: str) -> dict[str, Any]:
+    """The content of a std_msgs/Header with a stamp in nanoseconds."""
+    return {"stamp": {"sec": stamp // NANOSECONDS, "nanosec": stamp % NANOSECONDS}, "frame_id": frame_id}
+
+
 def write_compressed_image(stamp: int, frame_id: str, image_format: str, encoded: bytes) -> bytes:
     """CDR bytes of a CompressedImage."""
-    writer = _Writer()
-    writer.header(stamp, frame_id)
-    writer.string(image_format)
-    writer.numbers("I", len(encoded))
-    return bytes(writer.data) + encoded
+    return write(COMPRESSED_IMAGE, {"header": header(stamp, frame_id), "format": image_format, "data": encoded})
 
 
 def write_camera_info(stamp: int, frame_id: str, camera: Camera) -> bytes:
     """CDR bytes of the CameraInfo of a monocular camera (R identity, P = [K | 0])."""
-    writer = _Writer()
-    writer.header(stamp, frame_id)
-    writer.numbers("I", camera.height, camera.width)
-    writer.string(camera.distortion_model)
-    writer.numbers("I", len(camera.distortion))
-    writer.numbers("d", *camera.distortion, *camera.matrix.ravel(), *np.eye(3).ravel())
-    writer.numbers("d", *np.c_[camera.matrix, np.zeros(3)].ravel())
-    writer.numbers("I", 0, 0, 0, 0, 0, 0)
-    writer.numbers("B", 0)
-    return bytes(writer.data)
+    content = {
+        "header": header(stamp, frame_id),
+        "height": camera.height,
+        "width": camera.width,
+        "distortion_model": camera.distortion_model,
+        "d": list(camera.distortion),
+        "k": camera.matrix.ravel().tolist(),
+        "r": np.eye(3).ravel().tolist(),
+        "p": np.c_[camera.matrix, np.zeros(3)].ravel().tolist(),
+    }
+    return write(CAMERA_INFO, content)
+
+
+@functools.cache
+def _encoder(type_name: str) -> Callable[[Mapping[str, Any]], bytes]:
+    return serialize_dynamic(type_name, message_definition(type_name))[type_name]

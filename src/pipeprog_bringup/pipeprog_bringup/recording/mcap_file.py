@@ -1,13 +1,17 @@
-"""One mcap file, read by its own record framing, so that a torn or damaged one gives all it still holds.
+"""One mcap file, read record by record, so that a torn or damaged one gives all it still holds.
 
-The file's summary is a convenience that a power loss takes first; the walk over the record headers costs one small
-read per chunk and works on every file alike (format: https://mcap.dev/spec).
+A power loss takes the file's summary first; the walk over the record headers costs one small read per chunk and works
+on every file alike (format: https://mcap.dev/spec). The walk and the reading of chunks are our own:
+mcap.stream_reader.StreamReader reads every chunk whole to find the next record (to open a recording of 500 MB it reads
+500 MB, this module 20 kB), tells no byte offsets, gives nothing of a chunk that is cut off, and believes a record's
+length (one that says 3 GiB reserves 3 GiB). Schemas and channels are parsed by mcap.records.
 """
 
 from __future__ import annotations
 
 import contextlib
 import heapq
+import io
 import struct
 import zlib
 from collections import Counter
@@ -16,11 +20,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+
 from pipeprog_camera.errors import InputError
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0F
-_PIECE = 1 << 16
+_PIECE = 1 << 16  # bytes given to a decompressor at a time: of a damaged stream what lies before the fault is kept
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -134,14 +142,14 @@ class McapFile:
             opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, 0)
             end = position + 9 + length
             whole = len(head) == 9 and opcode != 0 and end <= size
-            if opcode == CHUNK and data_section:
+            if opcode == Opcode.CHUNK and data_section:
                 self._add_chunk(stream, position, min(end, size), whole)
             if not whole:
                 # Zeros or noise behind the last record are a tear as well: a file system may extend a file that never
                 # got its data.
-                self.torn_at = size if opcode == CHUNK else position
+                self.torn_at = size if opcode == Opcode.CHUNK else position
                 return
-            if opcode == FOOTER:
+            if opcode == Opcode.FOOTER:
                 stream.seek(end)
                 if stream.read(len(MAGIC)) != MAGIC:
                     self.torn_at = end
@@ -149,19 +157,22 @@ class McapFile:
                 for record in summary:
                     self._register(*record)
                 return
-            if opcode in (SCHEMA, CHANNEL) and data_section:
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and data_section:
                 self._register(opcode, stream.read(length))
-            elif opcode in (SCHEMA, CHANNEL):  # of a file that ends well: a tear may run through its summary
+            elif opcode in (
+                Opcode.SCHEMA,
+                Opcode.CHANNEL,
+            ):  # of a file that ends well: a tear may run through its summary
                 summary.append((opcode, stream.read(length)))
-            elif opcode == MESSAGE and data_section and length >= 22:
+            elif opcode == Opcode.MESSAGE and data_section and length >= 22:
                 channel_id, _, log_time = struct.unpack("<HIQ", stream.read(14))
                 counts = Counter({channel_id: 1})
                 self._blocks.append(_Block(position, log_time, 9 + length, in_chunk=False, counts=counts))
-            elif opcode == MESSAGE_INDEX and data_section and self._blocks and length >= 6:
+            elif opcode == Opcode.MESSAGE_INDEX and data_section and self._blocks and length >= 6:
                 channel_id, entries = struct.unpack("<HI", stream.read(6))
                 if entries:
                     self._blocks[-1].counts[channel_id] += entries // 16
-            elif opcode == DATA_END:
+            elif opcode == Opcode.DATA_END:
                 data_section = False
             position = end
 
@@ -181,19 +192,16 @@ class McapFile:
         )
 
     def _register(self, opcode: int, data: bytes) -> None:
-        try:
-            if opcode == SCHEMA:
-                schema_id, name_length = struct.unpack_from("<HI", data)
-                self._schemas.setdefault(schema_id, data[6 : 6 + name_length].decode())
+        """Note a schema or a channel; the first of its number counts, since a tear damages the summary first."""
+        stream = ReadDataStream(io.BytesIO(data))
+        with contextlib.suppress(McapError, struct.error, UnicodeDecodeError):
+            if opcode == Opcode.SCHEMA:
+                schema = records.Schema.read(stream)
+                self._schemas.setdefault(schema.id, schema.name)
             else:
-                channel_id, schema_id, topic_length = struct.unpack_from("<HHI", data)
-                topic = data[8 : 8 + topic_length].decode()
-                (encoding_length,) = struct.unpack_from("<I", data, 8 + topic_length)
-                encoding = data[12 + topic_length : 12 + topic_length + encoding_length].decode()
-                # The summary says again what is known already, and it is what a tear damages first.
-                self.channels.setdefault(channel_id, Channel(topic, self._schemas.get(schema_id, ""), encoding))
-        except (struct.error, UnicodeDecodeError):
-            return
+                channel = records.Channel.read(stream)
+                type_name = self._schemas.get(channel.schema_id, "")
+                self.channels.setdefault(channel.id, Channel(channel.topic, type_name, channel.message_encoding))
 
     def _read(self, stream: BinaryIO, block: _Block) -> list[Message]:
         """The messages of one block: all of them, or those before the tear."""
@@ -213,11 +221,11 @@ class McapFile:
             record = data[position + 9 : position + 9 + length]
             if opcode == 0 or len(record) < length:
                 break
-            if opcode in (SCHEMA, CHANNEL):
-                self._register(opcode, record)
-            elif opcode == MESSAGE and length >= 22:
+            if opcode == Opcode.MESSAGE and length >= 22:
                 channel_id, _, log_time = struct.unpack_from("<HIQ", record)
                 messages.append(Message(log_time, channel_id, _plain(record[22:])))
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._register(opcode, record)
             position += 9 + length
         return messages
 

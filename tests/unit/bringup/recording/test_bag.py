@@ -11,7 +11,8 @@ from mcap.writer import CompressionType
 
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag, MotionMessage
-from pipeprog_bringup.recording.bag_writer import BagWriter, message_definition
+from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.recording.definitions import message_definition
 from pipeprog_camera.errors import InputError
 from tests.unit.bringup.recordings import (
     CAMERA,
@@ -181,13 +182,8 @@ def test_two_cameras_are_listed_as_flags(tmp_path: Path) -> None:
 
 def uncalibrated(focal: float = 60.0, distortion_model: str = "plumb_bob") -> bytes:
     """A CameraInfo that Camera would refuse."""
-    writer = cdr._Writer()
-    writer.header(START, "camera")
-    writer.numbers("I", 48, 64)
-    writer.string(distortion_model)
-    writer.numbers("I", 0)
-    writer.numbers("d", focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1, *[0.0] * 21)
-    return bytes(writer.data) + bytes(32)
+    content = {"header": cdr.header(START, "camera"), "height": 48, "width": 64, "distortion_model": distortion_model}
+    return cdr.write(cdr.CAMERA_INFO, {**content, "k": [focal, 0.0, 31.5, 0.0, focal, 23.5, 0.0, 0.0, 1.0]})
 
 
 @pytest.mark.parametrize(
