@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from pipeprog_bringup.playback.session import State
@@ -83,61 +84,74 @@ def print_progress(product: Product) -> None:
 def print_score(figures: dict[str, Any]) -> None:
     """The figures of `score` as tables."""
     console = output_console()
+    console.print(_rates_table(figures))
+    console.print(_confusion_table(figures["confusion"]))
+    console.print(_errors_table(figures["pipes"]))
+    for name, value, form, unit in _single_figures(figures):
+        if value is not None:
+            console.print(f"{name:<30} {_number(value, form):>10} {unit}", highlight=False)
+    for key in ("missed", "false"):
+        if figures[key]:
+            console.print(f"{key}: {', '.join(figures[key])}", highlight=False, markup=False)
+
+
+def _rates_table(figures: dict[str, Any]) -> Table:
     table = Table(title=f"Found and classified (aligned by {figures['alignment']})", title_justify="left")
     for name in ("", "true", "false", "missed", "precision", "recall", "F", "accuracy"):
-        table.add_column(name, justify="left" if not name else "right")
-    for key, title in (
-        ("detection", "all detections"),
-        ("planned", "of planned classes"),
-        ("classification", "right class"),
-    ):
+        table.add_column(name, justify="right" if name else "left")
+    titles = {"detection": "all detections", "planned": "of planned classes", "classification": "right class"}
+    for key, title in titles.items():
         rates = figures[key]
         counts = (str(rates[name]) for name in ("true_positives", "false_positives", "false_negatives"))
         shares = (_number(rates[name], ".3f") for name in ("precision", "recall", "f_measure", "accuracy"))
         table.add_row(title, *counts, *shares)
-    console.print(table)
+    return table
+
+
+def _confusion_table(confusion: dict[str, Any]) -> Table:
+    table = Table(title="Pipes of each true class (rows) by the class found (columns)", title_justify="left")
+    table.add_column("true \\ found")
+    for label in confusion["labels"]:
+        table.add_column(Text(label), justify="right")
+    for label, counts in zip(confusion["labels"], confusion["matrix"], strict=True):
+        table.add_row(Text(label), *map(str, counts))
+    return table
+
+
+def _errors_table(pipes: Sequence[dict[str, Any]]) -> Table:
     table = Table(title="Pipes", title_justify="left")
-    for name in (
-        "truth",
-        "found",
-        "class",
-        "radius [mm]",
-        "radius error [mm]",
-        "length [m]",
-        "length error [%]",
-        "off axis [mm]",
-    ):
-        table.add_column(name, justify="left" if name in ("truth", "found", "class") else "right")
-    for pipe in figures["pipes"]:
+    for name in ("truth", "found", "class"):
+        table.add_column(name)
+    for name in ("radius [mm]", "radius error [mm]", "length [m]", "length error [%]", "off axis [mm]"):
+        table.add_column(name, justify="right")
+    for pipe in pipes:
         measures = (
-            1e3 * pipe["true_radius"],
-            pipe["radius_error_mm"],
-            pipe["true_length"],
-            pipe["length_error_percent"],
+            (1e3 * pipe["true_radius"], ".1f"),
+            (pipe["radius_error_mm"], "+.3f"),
+            (pipe["true_length"], ".3f"),
+            (pipe["length_error_percent"], "+.2f"),
+            (pipe["axis_distance_mm"], ".1f"),
         )
-        cells = (_number(value, form) for value, form in zip(measures, (".1f", "+.3f", ".3f", "+.2f"), strict=True))
-        table.add_row(
-            pipe["truth"], pipe["id"], pipe["class"] or "none", *cells, _number(pipe["axis_distance_mm"], ".1f")
-        )
-    console.print(table)
-    lines = [
+        cells = (_number(value, form) for value, form in measures)
+        table.add_row(Text(pipe["truth"]), Text(pipe["id"]), Text(pipe["class"] or "none"), *cells)
+    return table
+
+
+def _single_figures(figures: dict[str, Any]) -> list[tuple[str, float | None, str, str]]:
+    """Name, value (None: not known), format and unit of the figures that are no table."""
+    single = [
         ("radius RMSE", figures["radius"]["rmse_mm"], ".3f", "mm"),
         ("length error, mean", figures["length"]["mean_error_percent"], ".2f", "%"),
         *((f"metres of {c['class']}", c["error_percent"], "+.2f", "%") for c in figures["length"]["per_class"]),
         ("scale error", figures["scale"]["error_percent"], "+.4f", "%"),
     ]
     if figures["trajectory"]:
-        lines += [
+        single += [
             ("camera positions, rigid", figures["trajectory"]["rms_rigid_mm"], ".2f", "mm rms"),
             ("camera positions, similarity", figures["trajectory"]["rms_similarity_mm"], ".2f", "mm rms"),
             ("worst camera, similarity", figures["trajectory"]["max_similarity_mm"], ".2f", "mm"),
         ]
-    for name, value, form, unit in lines:
-        if value is not None:
-            console.print(f"{name:<30} {_number(value, form):>10} {unit}", highlight=False)
-    for key in ("missed", "false"):
-        if figures[key]:
-            console.print(f"{key}: {', '.join(figures[key])}", highlight=False, markup=False)
+    return single
 
 
 def _number(value: float | None, form: str) -> str:

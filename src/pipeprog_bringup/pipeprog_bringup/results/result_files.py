@@ -29,7 +29,11 @@ FRAME_COLUMNS = (
     *("stamp", "chosen", "reason", "overlap_n", "overlap_predicted", "parallax", "sharpness", "registered"),
     *("cell_overlap", "tie_points"),
 )
-_PACKAGES = ("numpy", "scipy", "numba", "opencv-python-headless", "pycolmap", "mcap", "ros-rclpy")
+# What a run's files come from, besides pipeprog itself.
+_PACKAGES = (
+    *("numpy", "scipy", "scikit-learn", "numba", "opencv-python-headless", "pycolmap"),
+    *("mcap", "mcap-ros2-support", "laspy", "ros-rclpy"),
+)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ scored apart.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,9 @@ def score(result: Result, truth: Truth, trajectory: Alignment | None = None) -> 
     """All figures as plain numbers, strings and lists; None where there is nothing to take a figure of.
 
     `detection` counts every detection; in `planned` only those with a class count, so a cylinder that was left without
-    a class is not a false one there; in `classification` a match counts only with the right class.
+    a class is not a false one there; in `classification` a match counts only with the right class. `confusion` counts
+    true classes (rows) against found ones (columns): its labels are the classes, "unplanned" for a pipe of no planned
+    class, and "none" for what is not there (a missed pipe's column, a false one's row).
     """
     world_from_map = np.eye(4) if trajectory is None else trajectory.world_from_map
     found = [_moved(pipe, world_from_map) for pipe in result.pipes]
@@ -119,6 +121,7 @@ def score(result: Result, truth: Truth, trajectory: Alignment | None = None) -> 
             **_rates(len(right), len(planned) - len(right) + false_planned, of_a_class - len(right)),
             "right_of_matched": _ratio(len(right), len(matches)),
         },
+        "confusion": _confusion(found, matches, false, true_classes, result.class_radii),
         "ignored": len(ignored),
         "radius": _radius_figures(errors),
         "length": _length_figures(errors, found, ignored, truth, result.class_radii, true_classes),
@@ -290,6 +293,31 @@ def _errors(detection: Segment, pipe: Segment) -> dict[str, Any]:
         "axis_distance_mm": 1e3 * distance,
         "angle_deg": float(np.degrees(angle)),
     }
+
+
+def _confusion(
+    found: Sequence[Segment],
+    matches: dict[int, int],
+    false: Sequence[int],
+    true_classes: Sequence[list[str]],
+    class_names: Iterable[str],
+) -> dict[str, Any]:
+    """Labels, and counts of true classes (rows) against found ones (columns)."""
+    from sklearn.metrics import confusion_matrix  # here, since its import takes a second
+
+    labels = [*class_names, "unplanned", "none"]
+    unplanned, none = len(labels) - 2, len(labels) - 1
+    found_as = [unplanned if pipe.class_name is None else labels.index(pipe.class_name) for pipe in found]
+    match_of = {j: i for i, j in matches.items()}
+    pairs = [(none, found_as[i]) for i in false]
+    for j, names in enumerate(true_classes):
+        label = found_as[match_of[j]] if j in match_of else none
+        # Where several classes share the true radius, the found one is right if it is among them.
+        candidates = [labels.index(name) for name in names] or [unplanned]
+        pairs.append((label if label in candidates else candidates[0], label))
+    true, predicted = zip(*pairs, strict=True) if pairs else ((), ())
+    matrix = confusion_matrix(true, predicted, labels=range(len(labels)))
+    return {"labels": labels, "matrix": matrix.tolist()}
 
 
 def _rates(true: int, false: int, missed: int) -> dict[str, Any]:

@@ -79,6 +79,36 @@ def test_a_pipe_left_without_class_is_found_but_missing_among_the_planned() -> N
     assert counts(figures["planned"]) == (2, 0, 1)
 
 
+def test_classes_are_counted_true_against_found() -> None:
+    """One right, one left without a class, one missed, one false, and one whose radius no planned class has."""
+    found = (
+        PERFECT[0],
+        dataclasses.replace(PERFECT[1], class_name=None),
+        segment(9.0, name="false", klass="DN100"),
+        segment(3.0, radius=0.2, name="d", klass="DN100"),
+    )
+    truth = Truth((*TRUE_PIPES, segment(3.0, radius=0.2, name="d")), (), NO_POSES)
+    confusion = score(Result(found, CLASSES), truth)["confusion"]
+    assert confusion["labels"] == ["DN65", "DN100", "unplanned", "none"]
+    assert confusion["matrix"] == [
+        [1, 0, 1, 0],  # DN65
+        [0, 0, 0, 1],  # DN100: missed
+        [0, 1, 0, 0],  # unplanned
+        [0, 1, 0, 0],  # none: a false pipe
+    ]
+    assert np.array(scored()["confusion"]["matrix"])[:, -1].tolist() == [2, 1, 0, 0]
+    assert np.sum(score(Result((), CLASSES), Truth((), (), NO_POSES))["confusion"]["matrix"]) == 0
+
+
+def test_of_classes_that_share_a_radius_either_is_right() -> None:
+    classes = {"hot": 0.0365, "cold": 0.0365}
+    found = tuple(
+        dataclasses.replace(pipe, class_name=name) for pipe, name in zip(TRUE_PIPES[:2], classes, strict=True)
+    )
+    confusion = score(Result(found, classes), Truth(TRUE_PIPES[:2], (), NO_POSES))["confusion"]
+    assert np.diag(confusion["matrix"]).tolist() == [1, 1, 0, 0]
+
+
 def test_ignored_cylinders_count_neither_way() -> None:
     stub = segment(3.0, length=0.12)
     found = dataclasses.replace(stub, start=stub.start + np.array([0, 0, 0.02]), length=0.1, class_name="DN65")
