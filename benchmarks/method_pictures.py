@@ -484,7 +484,7 @@ def main(folder: Path, names: list[str]) -> None:
                     text.set_fontsize(7)
         drawn = io.BytesIO()
         figure.savefig(drawn, dpi=DPI, format="png")
-        picture = Image.open(drawn).convert("RGB").quantize(COLORS, dither=Image.Dither.NONE)
+        picture = Image.open(drawn).convert("RGB").quantize(COLORS, Image.Quantize.FASTOCTREE)
         target = IMAGES / f"method_{stage.__name__}.png"
         picture.save(target, optimize=True)
         print(f"{target.name}: {target.stat().st_size / 1024:.0f} kB", flush=True)
