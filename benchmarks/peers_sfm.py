@@ -29,7 +29,7 @@ from benchmarks.survey import RESULTS
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.boards.triangulation import similarity
+from pipeprog_camera.similarity import similarity
 from pipeprog_sfm.config import MapperConfig, SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.warm_up import warm_up

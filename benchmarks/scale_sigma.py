@@ -23,8 +23,8 @@ from sensor_msgs.msg import CompressedImage
 from benchmarks.recordings import Recording, made, site
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_camera.similarity import similarity
 from pipeprog_sfm.boards.board_file import load_board_file
-from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import ScaleEstimate

@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from pipeprog_bringup.results.result_files import read_frame_stamps, read_trajectory
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.similarity import similarity
 
 # When a detection is a pipe of the truth: axes nearer than the larger of the radius and 20 mm, angle under 3 degrees,
 # the common stretch over half of either length.
@@ -172,11 +173,11 @@ def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Alignme
     tripod = np.array([[0, 0, 0, 1], [spread, 0, 0, 1], [0, spread, 0, 1], [0, 0, spread, 1]]).T
     corners = np.swapaxes(map_from_camera @ tripod, 1, 2)[..., :3].reshape(-1, 3)
     true_corners = np.swapaxes(world_from_camera @ tripod, 1, 2)[..., :3].reshape(-1, 3)
-    rigid_residuals = _residuals(positions, true_positions, _umeyama(positions, true_positions, scaled=False))
-    world_from_map = _umeyama(positions, true_positions, scaled=True)
+    rigid_residuals = _residuals(positions, true_positions, similarity(positions, true_positions, scaled=False))
+    world_from_map = similarity(positions, true_positions)
     residuals = _residuals(positions, true_positions, world_from_map)
     return Alignment(
-        world_from_map=_umeyama(corners, true_corners, scaled=False),
+        world_from_map=similarity(corners, true_corners, scaled=False),
         poses=len(positions),
         scale_error=1 / float(np.cbrt(np.linalg.det(world_from_map[:3, :3]))) - 1,
         rms_rigid=_rms(rigid_residuals),
@@ -385,17 +386,3 @@ def _rms(values: Sequence[float] | FloatArray) -> float:
 
 def _residuals(points: FloatArray, true_points: FloatArray, transform: FloatArray) -> FloatArray:
     return np.linalg.norm(points @ transform[:3, :3].T + transform[:3, 3] - true_points, axis=1)
-
-
-def _umeyama(points: FloatArray, true_points: FloatArray, scaled: bool) -> FloatArray:
-    """(4, 4) similarity or rigid motion that lays `points` (N, 3) onto `true_points` with least squares."""
-    centre, true_centre = points.mean(0), true_points.mean(0)
-    p, q = points - centre, true_points - true_centre
-    u, singular, vt = np.linalg.svd(q.T @ p)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u * signs @ vt
-    scale = (singular * signs).sum() / (p**2).sum() if scaled else 1.0
-    transform = np.eye(4)
-    transform[:3, :3] = scale * rotation
-    transform[:3, 3] = true_centre - scale * rotation @ centre
-    return transform

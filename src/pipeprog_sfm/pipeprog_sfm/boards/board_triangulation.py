@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.similarity import similarity
 from pipeprog_sfm.boards.board import Board, BoardObservation, layouts, symmetries
 from pipeprog_sfm.boards.board_adjustment import adjust_board
 from pipeprog_sfm.boards.board_covariance import PRIOR_CENTRE, PRIOR_POSE
 from pipeprog_sfm.boards.board_detection import detect_predicted_board
 from pipeprog_sfm.boards.ellipses import ImageEllipses
 from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, image_rows, project_rows
-from pipeprog_sfm.boards.triangulation import MIN_SINE, midpoints, similarity
+from pipeprog_sfm.boards.triangulation import MIN_SINE, midpoints
 from pipeprog_sfm.config import BoardConfig
 
 PARTNER_IMAGES = 6  # images that each image is paired with, near to far, to place a board

@@ -1,4 +1,4 @@
-"""Geometry of points and rays: where two rays meet, the similarity between two sets of points."""
+"""Geometry of points and rays: where two rays meet, cross products as matrices."""
 
 from __future__ import annotations
 
@@ -27,19 +27,6 @@ def midpoints(
     depths = np.stack([(along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2])
     points = 0.5 * (origins_a + depths[0][..., None] * rays_a + origins_b + depths[1][..., None] * rays_b)
     return points, depths, np.sqrt(sine2)
-
-
-def similarity(source: FloatArray, target: FloatArray) -> FloatArray:
-    """(4, 4) least-squares similarity target_from_source of (N, 3) points (Umeyama, 1991)."""
-    mean_source, mean_target = source.mean(0), target.mean(0)
-    centred = source - mean_source
-    left, values, right = np.linalg.svd((target - mean_target).T @ centred)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    linear = (left * signs) @ right * ((values * signs).sum() / (centred**2).sum())
-    transform = np.eye(4)
-    transform[:3, :3] = linear
-    transform[:3, 3] = mean_target - linear @ mean_source
-    return transform
 
 
 def cross_matrices(vectors: FloatArray) -> FloatArray:

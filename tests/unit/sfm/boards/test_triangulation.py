@@ -4,18 +4,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipeprog_sfm.boards.triangulation import cross_matrices, midpoints, similarity
+from pipeprog_camera.similarity import similarity
+from pipeprog_sfm.boards.triangulation import cross_matrices, midpoints
 
 
 @settings(max_examples=10, deadline=None)
-@given(st.integers(0, 2**16))
-def test_similarity_is_found_from_its_points(seed):
+@given(seed=st.integers(0, 2**16), scaled=st.booleans())
+def test_similarity_is_found_from_its_points(seed, scaled):
     rng = np.random.default_rng(seed)
     true = np.eye(4)
-    true[:3, :3] = rng.uniform(0.1, 10) * Rotation.random(random_state=seed).as_matrix()
+    true[:3, :3] = (rng.uniform(0.1, 10) if scaled else 1.0) * Rotation.random(random_state=seed).as_matrix()
     true[:3, 3] = rng.normal(0, 5, 3)
     points = np.c_[rng.normal(0, 1, (6, 2)), np.zeros(6)]
-    assert similarity(points, points @ true[:3, :3].T + true[:3, 3]) == pytest.approx(true, abs=1e-8)
+    assert similarity(points, points @ true[:3, :3].T + true[:3, 3], scaled=scaled) == pytest.approx(true, abs=1e-8)
 
 
 @settings(max_examples=30, deadline=None)

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from targets import BOARD, CAMERA, LOPSIDED, Walk, camera_from_board, exact_ellipses, render
 
+from pipeprog_camera.similarity import similarity
 from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile, KnownDistance
-from pipeprog_sfm.boards.triangulation import similarity
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
