@@ -32,8 +32,8 @@ from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.journal import Journal
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
-from pipeprog_sfm.sparse.overlap import FrameTie
-from pipeprog_sfm.worker import Finish, Finished, Keyframe, KeyframeDone, MapReady, Ready, Retire, Retired, serve
+from pipeprog_sfm.sparse.overlap import OverlapReport
+from pipeprog_sfm.worker import AddKeyframe, Finish, Finished, KeyframeDone, MapReady, Ready, Retire, Retired, serve
 
 MAX_BACKLOG = 50  # keyframes that wait for the worker; as deep as the topic's queue
 MAX_VAIN_STARTS = 2  # of the worker that end before it has answered anything
@@ -133,7 +133,7 @@ class SfmNode(Node):
         if self._worker.backlog >= MAX_BACKLOG:
             self._dropped += 1
         else:
-            self._send(Keyframe(stamp, bytes(image.data), camera, frame_id, self._take_motion()))
+            self._send(AddKeyframe(stamp, bytes(image.data), camera, frame_id, self._take_motion()))
         self._retire_when_due()
         self._finish_when_complete()
 
@@ -229,7 +229,7 @@ class SfmNode(Node):
         done = () if self._journal is None else self._journal.record(0, self._answered)
         return WorkerProcess(self, serve, (*self._arguments, done), self._on_event, self._on_death)
 
-    def _send(self, command: Keyframe | Retire) -> None:
+    def _send(self, command: AddKeyframe | Retire) -> None:
         if self._journal is not None:
             self._journal.append(command)
         self._worker.send(command)
@@ -243,7 +243,7 @@ class SfmNode(Node):
         self.get_logger().error(f"{died}: it is started again, and takes its {self._answered} keyframes again")
         self._ready = False
         suspect = next(iter(self._journal.record(self._answered, self._answered + 1)), None)
-        if isinstance(suspect, Keyframe):
+        if isinstance(suspect, AddKeyframe):
             self._journal.remove(self._answered)
             self._dropped += 1
         self._worker = self._start_worker()
@@ -252,7 +252,7 @@ class SfmNode(Node):
         if self._finish_sent:
             self._worker.send(Finish(self._take_motion(), self._colmap))
 
-    def _publish_overlap(self, header: Header, ties: list[FrameTie]) -> None:
+    def _publish_overlap(self, header: Header, ties: list[OverlapReport]) -> None:
         self._overlap.publish(
             msg.ImageOverlapArray(
                 header=header,

@@ -25,7 +25,7 @@ from pipeprog_sfm.metric.scale import NoScaleError, ScaleEstimate
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
-from pipeprog_sfm.sparse.overlap import FrameTie
+from pipeprog_sfm.sparse.overlap import OverlapReport
 
 
 class NotMetricError(Exception):
@@ -149,7 +149,7 @@ class Reconstruction:
         ]
         write_model(folder, views, points @ scale.map_from_model[:3, :3].T + scale.map_from_model[:3, 3])
 
-    def ties(self) -> list[FrameTie]:
+    def ties(self) -> list[OverlapReport]:
         """Overlap of the keyframes that changed since the last call (Eq. 1)."""
         return self._mapper.ties()
 

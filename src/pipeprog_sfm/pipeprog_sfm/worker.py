@@ -15,7 +15,7 @@ from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
-from pipeprog_sfm.sparse.overlap import FrameTie
+from pipeprog_sfm.sparse.overlap import OverlapReport
 from pipeprog_sfm.warm_up import warm_up
 
 IDLE_SECONDS = 1.0  # without a command, after which a map goes out early: nobody knows when the next keyframe comes
@@ -23,7 +23,7 @@ POLL_SECONDS = 0.1  # between looks at the map under way
 
 
 @dataclass(frozen=True)
-class Keyframe:
+class AddKeyframe:
     """Command: take this keyframe and the motion before it; `encoded` holds JPEG or PNG bytes."""
 
     stamp: int
@@ -59,7 +59,7 @@ class KeyframeDone:
 
     stamp: int
     status: Status
-    ties: list[FrameTie]
+    ties: list[OverlapReport]
     trajectory: Trajectory | None
 
 
@@ -68,7 +68,7 @@ class Retired:
     """Event: a Retire is worked off."""
 
     status: Status
-    ties: list[FrameTie]
+    ties: list[OverlapReport]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def serve(
     connection: Connection,
     config: SfmConfig,
     board_file: BoardFile,
-    answered: Iterable[Keyframe | Retire],
+    answered: Iterable[AddKeyframe | Retire],
 ) -> None:
     """Works off commands from `connection` until it closes; those that a predecessor has answered come before."""
     warm_up(config)
@@ -111,7 +111,7 @@ def serve(
                 since_map = 0  # another map after the last one would have a stamp that no pipes have
                 continue
             connection.send(_answer(reconstruction, command))
-            if isinstance(command, Keyframe):
+            if isinstance(command, AddKeyframe):
                 reconstruction.update_dense()  # once the pose is out
                 since_map += 1
             idle_since = time.monotonic()
@@ -128,14 +128,14 @@ def serve(
                 reconstruction.request_map()
 
 
-def _answer(reconstruction: Reconstruction, command: Keyframe | Retire) -> KeyframeDone | Retired:
-    if isinstance(command, Keyframe):
+def _answer(reconstruction: Reconstruction, command: AddKeyframe | Retire) -> KeyframeDone | Retired:
+    if isinstance(command, AddKeyframe):
         return _add(reconstruction, command)
     reconstruction.retire(command.stamps)
     return Retired(reconstruction.status(), reconstruction.ties())
 
 
-def _add(reconstruction: Reconstruction, keyframe: Keyframe) -> KeyframeDone:
+def _add(reconstruction: Reconstruction, keyframe: AddKeyframe) -> KeyframeDone:
     reconstruction.move(keyframe.motion)
     try:
         reconstruction.add(keyframe.stamp, keyframe.encoded, keyframe.camera, keyframe.frame)

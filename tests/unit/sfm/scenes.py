@@ -14,7 +14,7 @@ from pipeprog_sfm.sparse.features import Features, root_sift
 from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import match
 from pipeprog_sfm.sparse.sparse_model import SparseModel
-from pipeprog_sfm.sparse.two_view import model_of_pair
+from pipeprog_sfm.sparse.two_view import model_from_pair
 
 VIEWS, POINTS = 6, 150
 FOCAL = 900.0
@@ -168,7 +168,7 @@ def matched(one: Keyframe, other: Keyframe) -> NDArray[np.int32]:
 def started(first: int, second: int) -> SparseModel:
     """The model of two keyframes of the walk."""
     one, other = keyframe(first), keyframe(second)
-    model = model_of_pair(one, other, matched(one, other), seed=0)
+    model = model_from_pair(one, other, matched(one, other), seed=0)
     assert model is not None
     return model
 

@@ -75,8 +75,8 @@ def received(connection, seconds: float) -> list[object]:
     return events
 
 
-def keyframe() -> worker.Keyframe:
-    return worker.Keyframe(1, np.zeros(3, np.uint8).tobytes(), CAMERA)
+def keyframe() -> worker.AddKeyframe:
+    return worker.AddKeyframe(1, np.zeros(3, np.uint8).tobytes(), CAMERA)
 
 
 def test_no_map_follows_the_last_one(serving):

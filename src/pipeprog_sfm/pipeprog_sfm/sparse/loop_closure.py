@@ -14,7 +14,7 @@ from pipeprog_sfm.sparse.sparse_model import SparseModel
 MAX_DRIFT = 0.05  # of the way since: what exceeds it is no drift but another place that looks alike
 
 
-def untied(model: SparseModel, view: int) -> IntArray:
+def loop_candidates(model: SparseModel, view: int) -> IntArray:
     """Views of long ago, by their numbers; none where the view shares points with them: it is where it seems to be."""
     rank = np.argsort(np.argsort(model.stamps))
     old = np.abs(rank - rank[view]) > 2 * LOCAL_WINDOW
@@ -35,7 +35,7 @@ def is_drift(model: SparseModel, view: int, other: int, scale: float, correction
     return bool(drift <= MAX_DRIFT * way)
 
 
-def shares(model: SparseModel, kept: IntArray, corrected: int) -> FloatArray:
+def correction_weights(model: SparseModel, kept: IntArray, corrected: int) -> FloatArray:
     """(V,) how much of a correction each view takes: 0 at the views `kept`, 1 at the view `corrected`.
 
     The harmonic function on the graph of the views, each two tied as firmly as they share points: like the potential
@@ -56,7 +56,7 @@ def shares(model: SparseModel, kept: IntArray, corrected: int) -> FloatArray:
     return share
 
 
-def bend(model: SparseModel, share: FloatArray, scale: float, correction: FloatArray) -> None:
+def distribute_correction(model: SparseModel, share: FloatArray, scale: float, correction: FloatArray) -> None:
     """Moves each view and what it was the first to see by its share (V,) of a similarity.
 
     correction (4, 4) is rigid, applied after the scale; a share of it is a power of the similarity.

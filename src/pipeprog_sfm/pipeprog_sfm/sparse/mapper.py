@@ -14,14 +14,14 @@ from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.sparse.features import Features, extract
 from pipeprog_sfm.sparse.guided_matching import link, partners
 from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.loop_closure import bend, is_drift, shares, untied
+from pipeprog_sfm.sparse.loop_closure import correction_weights, distribute_correction, is_drift, loop_candidates
 from pipeprog_sfm.sparse.matching import MatchArray
-from pipeprog_sfm.sparse.model_merging import merge, relation
-from pipeprog_sfm.sparse.overlap import FrameTie, Overlaps
-from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS, Location, enter, locate, objection
+from pipeprog_sfm.sparse.model_merging import merge, similarity_between
+from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
+from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS, Location, add_view, locate, rejection_reason
 from pipeprog_sfm.sparse.retrieval import GLANCE, Retrieval
 from pipeprog_sfm.sparse.sparse_model import SparseModel
-from pipeprog_sfm.sparse.two_view import model_of_pair
+from pipeprog_sfm.sparse.two_view import model_from_pair
 
 COARSE = 1500  # strongest features that are matched without a prediction: enough for a pose, a seventh of the cost
 GLANCED = MIN_INLIERS * GLANCE // COARSE  # matches of so few features that make a full comparison worth while
@@ -58,7 +58,7 @@ class Mapper:
         self._chosen: int | None = None
         self._revision = 0
         self._retrieval = Retrieval()
-        self._overlaps = Overlaps()
+        self._overlaps = OverlapTracker()
 
     @property
     def seen(self) -> int:
@@ -246,7 +246,7 @@ class Mapper:
             seen[stamp] = row[own[own >= 0]], pixels
         return model.points[ids], seen
 
-    def ties(self) -> list[FrameTie]:
+    def ties(self) -> list[OverlapReport]:
         """Overlap of the keyframes for which it changed since the last call."""
         return self._overlaps.changed(self._keyframes, self._published if self._models else SparseModel())
 
@@ -283,9 +283,9 @@ class Mapper:
         location = locate(model, keyframe, matches, self._seed)
         if location.camera_from_model is None:
             return KeyframeReport(stamp, False, location.reason, 0, 0.0)
-        view = enter(model, keyframe, location, self._keyframes)
+        view = add_view(model, keyframe, location, self._keyframes)
         self._evidence[stamp] = matches
-        refusal = objection(model, view, matches)
+        refusal = rejection_reason(model, view, matches)
         if refusal:
             self._drop(model, view)
             return KeyframeReport(stamp, False, refusal, len(location.pairs), 0.0)
@@ -322,7 +322,7 @@ class Mapper:
         for stamp in self._waiting[-START_CANDIDATES - 1 : -1]:
             waiting = self._keyframes[stamp]
             matches = self._retrieval.matches(waiting, keyframe, COARSE)
-            model = model_of_pair(waiting, keyframe, matches, self._seed)
+            model = model_from_pair(waiting, keyframe, matches, self._seed)
             if model is not None and (best is None or _tracks(model) > _tracks(best)):
                 best = model
         if best is None:
@@ -348,7 +348,7 @@ class Mapper:
             alike = self._alike(other, keyframe)
             if not len(alike):
                 continue
-            found = relation(own, own.stamps.index(stamp), other, self._locate(other, keyframe, alike))
+            found = similarity_between(own, own.stamps.index(stamp), other, self._locate(other, keyframe, alike))
             if found is not None:
                 self._join(own, other, *found, stamp)
                 return
@@ -374,7 +374,7 @@ class Mapper:
         view = model.stamps.index(stamp)
         if view % LOOKOUT:
             return
-        known = untied(model, view)
+        known = loop_candidates(model, view)
         if not len(known):
             return
         keyframe = self._keyframes[stamp]
@@ -383,10 +383,10 @@ class Mapper:
         alike = self._resembling(model, keyframe, views, GLANCED)
         if not len(alike):
             return
-        found = relation(model, view, model, self._locate(model, keyframe, alike))
+        found = similarity_between(model, view, model, self._locate(model, keyframe, alike))
         if found is None or not is_drift(model, view, int(alike[0]), *found):
             return
-        bend(model, shares(model, alike, view), *found)
+        distribute_correction(model, correction_weights(model, alike, view), *found)
         order = np.argsort(model.stamps)
         place = int(np.flatnonzero(order == view)[0])
         for other in order[max(place - LOCAL_WINDOW, 0) : place + LOCAL_WINDOW]:
@@ -397,7 +397,7 @@ class Mapper:
         """Adjusts all views, and sends those back to wait whose poses turn out wrong."""
         model.adjust(None, 10, 1e-3)
         for view in reversed(range(len(model))):
-            if len(model) > 2 and objection(model, view, self._evidence.get(model.stamps[view], {})):
+            if len(model) > 2 and rejection_reason(model, view, self._evidence.get(model.stamps[view], {})):
                 self._waiting.append(model.stamps[view])
                 self._drop(model, view)
         model.adjusted_at = len(model)

@@ -11,7 +11,7 @@ from pipeprog_sfm.sparse.sparse_model import SparseModel
 DEPTH_TOLERANCE = 0.05  # of a point's depth in two models: its noise at the smallest angle
 
 
-def relation(
+def similarity_between(
     source: SparseModel, view: int, target: SparseModel, location: Location
 ) -> tuple[float, FloatArray] | None:
     """Scale and rigid target_from_source (4, 4), applied after it, by a view of the source located in the target.

@@ -15,7 +15,7 @@ NO_STAMP = -1
 
 
 @dataclass(frozen=True)
-class FrameTie:
+class OverlapReport:
     """Overlap of a keyframe with the map: Eq. 1 of the paper (hull areas) and the share of 32 x 18 cells."""
 
     stamp: int
@@ -28,7 +28,7 @@ class FrameTie:
     matches_next: int
 
 
-class Overlaps:
+class OverlapTracker:
     """Remembers of which points of the map each keyframe's overlap was told."""
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class Overlaps:
         """A keyframe that comes again is told anew."""
         self._told.pop(stamp, None)
 
-    def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel) -> list[FrameTie]:
+    def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel) -> list[OverlapReport]:
         """Overlap of the keyframes, by stamp, for which it changed since the last call."""
         view_of = {stamp: view for view, stamp in enumerate(model.stamps)}
         stamps = sorted(keyframes)
@@ -51,16 +51,16 @@ class Overlaps:
             if self._told.get(stamp) != mark:
                 self._told[stamp] = mark
                 near = (model.point_of[tied[one]] if one in tied else None for one in (before, stamp, after))
-                changed.append(_tie(keyframes[stamp], *near))
+                changed.append(_report(keyframes[stamp], *near))
         return changed
 
 
-def _tie(keyframe: Keyframe, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> FrameTie:
+def _report(keyframe: Keyframe, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> OverlapReport:
     """Overlap of a keyframe by the points of its features and of its neighbours'; None: not registered."""
     keypoints = keyframe.features.keypoints
     inside = keypoints[:0] if own is None else keypoints[own >= 0]
     size = keyframe.camera.width, keyframe.camera.height
-    return FrameTie(
+    return OverlapReport(
         keyframe.stamp,
         own is not None,
         hull_area(inside) / max(keyframe.hull, 1e-9),

@@ -51,7 +51,7 @@ def locate(model: SparseModel, keyframe: Keyframe, matches: Mapping[int, MatchAr
     return Location(pose.camera_from_model, known[pose.inliers], "")
 
 
-def enter(model: SparseModel, keyframe: Keyframe, location: Location, keyframes: Mapping[int, Keyframe]) -> int:
+def add_view(model: SparseModel, keyframe: Keyframe, location: Location, keyframes: Mapping[int, Keyframe]) -> int:
     """Adds a located keyframe: its pose, then tracks and local adjustment; returns its view.
 
     keyframes: at least those of the model's views and this one, by stamp.
@@ -66,7 +66,7 @@ def enter(model: SparseModel, keyframe: Keyframe, location: Location, keyframes:
     return view
 
 
-def objection(model: SparseModel, view: int, matches: Mapping[int, MatchArray]) -> str:
+def rejection_reason(model: SparseModel, view: int, matches: Mapping[int, MatchArray]) -> str:
     """Why a pose cannot be believed: too few points, or matches with its neighbours, by stamp, that contradict it."""
     tied = len(model.seen(view))
     if tied < MIN_INLIERS:

@@ -15,7 +15,7 @@ START_POINTS = 40  # of a new model
 START_ANGLE = np.radians(3.0)  # median between the rays of its points
 
 
-def model_of_pair(first: Keyframe, second: Keyframe, matches: MatchArray, seed: int) -> SparseModel | None:
+def model_from_pair(first: Keyframe, second: Keyframe, matches: MatchArray, seed: int) -> SparseModel | None:
     """The model that two keyframes with (M, 2) matches give; None: too few points, or depths too uncertain.
 
     The first one is its origin, and the distance between the two its unit.

@@ -8,7 +8,7 @@ from scenes import POINTS, VIEWS, sparse_model
 
 import pipeprog_sfm.sparse.loop_closure as loop_module
 from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
-from pipeprog_sfm.sparse.loop_closure import bend, is_drift, shares, untied
+from pipeprog_sfm.sparse.loop_closure import correction_weights, distribute_correction, is_drift, loop_candidates
 from pipeprog_sfm.sparse.sparse_model import NONE
 
 SCALE = 1.02
@@ -19,13 +19,15 @@ CORRECTION[:3, 3] = [0.0, 0.02, 0.0]
 
 def test_views_that_are_tied_alike_take_half_of_a_correction() -> None:
     # Each of six views sees all points.
-    assert shares(sparse_model(), np.array([0]), VIEWS - 1) == pytest.approx([0.0, *[0.5] * (VIEWS - 2), 1.0], abs=1e-6)
+    assert correction_weights(sparse_model(), np.array([0]), VIEWS - 1) == pytest.approx(
+        [0.0, *[0.5] * (VIEWS - 2), 1.0], abs=1e-6
+    )
 
 
 def test_a_whole_share_for_all_is_the_similarity_itself() -> None:
     model = sparse_model()
     points, centres = model.points.copy(), model.centres()
-    bend(model, np.ones(VIEWS), SCALE, CORRECTION)
+    distribute_correction(model, np.ones(VIEWS), SCALE, CORRECTION)
     assert model.points == pytest.approx(SCALE * points @ CORRECTION[:3, :3].T + CORRECTION[:3, 3], abs=1e-9)
     assert model.centres() == pytest.approx(SCALE * centres @ CORRECTION[:3, :3].T + CORRECTION[:3, 3], abs=1e-9)
     assert model.errors(np.arange(VIEWS * POINTS)).max() < 1e-6
@@ -34,7 +36,7 @@ def test_a_whole_share_for_all_is_the_similarity_itself() -> None:
 def test_views_move_by_their_shares_and_points_with_who_saw_them_first() -> None:
     model = sparse_model()
     points, centres = model.points.copy(), model.centres()
-    bend(model, np.array([0.0, 0, 0, 0.5, 1, 1]), 1.0, CORRECTION)
+    distribute_correction(model, np.array([0.0, 0, 0, 0.5, 1, 1]), 1.0, CORRECTION)
     assert (model.points == points).all(), "the first view saw them all, and stays"
     assert model.centres()[:3] == pytest.approx(centres[:3], abs=1e-12)
     assert model.centres()[4] == pytest.approx(CORRECTION[:3, :3] @ centres[4] + CORRECTION[:3, 3], abs=1e-9)
@@ -51,8 +53,8 @@ def test_drift_is_small_beside_the_way(metres: float, drifted: bool) -> None:
 
 def test_views_of_long_ago_matter_while_nothing_ties_to_them(monkeypatch: pytest.MonkeyPatch) -> None:
     model = sparse_model()
-    assert not len(untied(model, VIEWS - 1)), "six views are no long time"
+    assert not len(loop_candidates(model, VIEWS - 1)), "six views are no long time"
     monkeypatch.setattr(loop_module, "LOCAL_WINDOW", 1)
-    assert not len(untied(model, VIEWS - 1)), "they share all points"
+    assert not len(loop_candidates(model, VIEWS - 1)), "they share all points"
     model.point_of[model.features(VIEWS - 1)] = NONE
-    assert untied(model, VIEWS - 1).tolist() == [0, 1, 2]
+    assert loop_candidates(model, VIEWS - 1).tolist() == [0, 1, 2]

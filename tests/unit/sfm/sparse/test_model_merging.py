@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from scenes import STEP, in_model, keyframe, matched, started
 
-from pipeprog_sfm.sparse.model_merging import merge, relation
-from pipeprog_sfm.sparse.registration import enter, locate
+from pipeprog_sfm.sparse.model_merging import merge, similarity_between
+from pipeprog_sfm.sparse.registration import add_view, locate
 
 TOLERANCE = 0.02  # of the base: 0.3 px of 300 points at 2 m are some 3 mm of a view's place
 
@@ -18,9 +18,9 @@ def test_models_that_share_a_view_are_made_one(swapped: bool) -> None:
     if swapped:
         fourth = keyframe(4)
         location = locate(other, fourth, {3 * STEP: matched(fourth, keyframe(3))}, seed=0)
-        enter(other, fourth, location, {n * STEP: keyframe(n) for n in (2, 3, 4)})
+        add_view(other, fourth, location, {n * STEP: keyframe(n) for n in (2, 3, 4)})
     location = locate(model, keyframe(2), {STEP: matched(keyframe(2), keyframe(1))}, seed=0)
-    found = relation(other, 0, model, location)
+    found = similarity_between(other, 0, model, location)
     assert found is not None
     assert found[0] == pytest.approx(1.0, abs=2 * TOLERANCE), "both have the same unit"
     smaller, larger = merge(other, model, *found)
@@ -35,4 +35,4 @@ def test_models_that_share_a_view_are_made_one(swapped: bool) -> None:
 def test_a_view_without_a_place_relates_nothing() -> None:
     model, other = started(0, 1), started(16, 17)
     location = locate(model, keyframe(16), {STEP: matched(keyframe(16), keyframe(1))}, seed=0)
-    assert relation(other, 0, model, location) is None
+    assert similarity_between(other, 0, model, location) is None

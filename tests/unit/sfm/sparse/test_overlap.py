@@ -8,7 +8,7 @@ from scenes import CAMERA, STEP
 
 from pipeprog_sfm.sparse.features import Features
 from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.overlap import Overlaps
+from pipeprog_sfm.sparse.overlap import OverlapTracker
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 
@@ -27,7 +27,7 @@ def test_overlap_is_the_share_of_the_hull_and_of_the_cells_that_tie_points_span(
     model.points = np.zeros((4, 3))
     model.point_of[:] = [0, 1, 2, 3, 0, 1, 2, -1]
     keyframes = {0: first, STEP: second, 2 * STEP: keyframe(2 * STEP, SQUARE)}
-    told = {tie.stamp: tie for tie in Overlaps().changed(keyframes, model)}
+    told = {tie.stamp: tie for tie in OverlapTracker().changed(keyframes, model)}
     assert (told[0].overlap, told[0].cell_overlap, told[0].tie_points) == (1.0, 1.0, 4)
     # Three corners span half of the square, in three of four cells.
     assert (told[STEP].overlap, told[STEP].cell_overlap) == (pytest.approx(0.5), 0.75)
@@ -38,7 +38,7 @@ def test_overlap_is_the_share_of_the_hull_and_of_the_cells_that_tie_points_span(
 
 
 def test_it_is_told_again_when_it_changes_and_when_it_was_forgotten() -> None:
-    one, overlaps, model = keyframe(0, SQUARE), Overlaps(), SparseModel()
+    one, overlaps, model = keyframe(0, SQUARE), OverlapTracker(), SparseModel()
     assert len(overlaps.changed({0: one}, model)) == 1
     assert overlaps.changed({0: one}, model) == []
     overlaps.forget(0)

@@ -7,7 +7,7 @@ import pytest
 from scenes import CAMERA, STEP, in_model, matched, pose, started, view
 
 from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.two_view import model_of_pair
+from pipeprog_sfm.sparse.two_view import model_from_pair
 
 TOLERANCE = 0.02  # of the base: 0.3 px of 300 points at 2 m are some 3 mm of a view's place
 
@@ -22,4 +22,4 @@ def test_two_views_are_a_model_whose_unit_is_their_distance() -> None:
 def test_two_views_from_one_place_are_no_model() -> None:
     one, other = (Keyframe.of(n * STEP, view(pose(0.0, 0.1 * n), n), CAMERA) for n in range(2))
     assert len(matched(one, other)) > 100
-    assert model_of_pair(one, other, matched(one, other), seed=0) is None
+    assert model_from_pair(one, other, matched(one, other), seed=0) is None
