@@ -25,9 +25,9 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import DeblurConfig, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
-from pipeprog_sfm.dense.dense_mapper import EncodedImage
 from pipeprog_sfm.sparse.features import Features
 from pipeprog_sfm.sparse.mapper import Mapper
+from pipeprog_sfm.types import EncodedImage
 
 EXPOSURES_MS = (8, 16, 32)
 OPTIONS = ("--size=480p", "--seconds=2.6", "--allow-hidden")
@@ -45,10 +45,10 @@ class Counted(Mapper):
         self.offered: dict[int, Features] = {}
         self.kept = 0
 
-    def exchange(self, stamp: int, features: Features) -> bool:
-        """As Mapper.exchange."""
+    def replace_features(self, stamp: int, features: Features) -> bool:
+        """As Mapper.replace_features."""
         self.offered[stamp] = features
-        kept = super().exchange(stamp, features)
+        kept = super().replace_features(stamp, features)
         self.kept += kept
         return kept
 
@@ -93,7 +93,7 @@ def compare(
         told = exposure if variant == "deblurred" else 0.0
         config = SfmConfig(deblur=DeblurConfig(exposure=told))
         mapper = Counted(config)
-        deblurrer = Deblurrer(config, mapper)
+        deblurrer = Deblurrer(config)
         for stamp, encoded in images.items():
             if variant == "all deblurred" and stamp in offered:
                 mapper.add_features(stamp, offered[stamp], camera)
@@ -101,18 +101,20 @@ def compare(
             gray = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
             assert gray is not None
             mapper.add(stamp, gray.astype(np.uint8, copy=False), camera)
-            deblurrer.add(stamp, EncodedImage(encoded, camera))
+            poses, image = mapper.map.camera_from_model(), EncodedImage(encoded, camera)
+            for other, features in deblurrer.deblurred(stamp, image, poses, mapper.map.points_seen):
+                mapper.replace_features(other, features)
         mapper.finish()
         offered = offered or mapper.offered
         yield {
             "variant": variant,
             "keyframes": len(images),
-            "registered": mapper.registered,
+            "registered": len(mapper.map.published),
             "offered": len(offered) if variant != "as it is" else 0,
             "kept": len(offered) if variant == "all deblurred" else mapper.kept,
-            "tie points in images": sum(tie.tie_points for tie in mapper.ties()),
-            "camera path RMSE [mm]": round(1e3 * _rmse(mapper.camera_from_model(), truth), 2),
-            "reprojection error [px]": round(mapper.reprojection_error, 3),
+            "tie points in images": sum(report.tie_points for report in mapper.map.overlap_reports()),
+            "camera path RMSE [mm]": round(1e3 * _rmse(mapper.map.camera_from_model(), truth), 2),
+            "reprojection error [px]": round(mapper.map.reprojection_error(), 3),
         }
 
 

@@ -37,7 +37,7 @@ def main(text: str) -> None:
     centres = dict(zip((stamp for stamp, _ in frames), truth.world_from_camera[:, :3, 3], strict=True))
 
     def row(what: str, used: int, mapper: Mapper) -> dict[str, float | int | str]:
-        poses = mapper.camera_from_model()
+        poses = mapper.map.camera_from_model()
         own = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in poses.values()])
         true = np.array([centres[stamp] for stamp in poses])
         onto = similarity(own, true)
@@ -46,8 +46,8 @@ def main(text: str) -> None:
             "images": what,
             "used": used,
             "share of the frames": round(used / len(frames), 3),
-            "registered": mapper.registered,
-            "models": mapper.models,
+            "registered": len(mapper.map.published),
+            "models": len(mapper.map.models),
             "path RMSE [mm]": round(1e3 * float(np.sqrt(np.mean(residual**2))), 4),
         }
 

@@ -48,10 +48,10 @@ def main(minutes: float) -> None:
         features = _view(points, looks, pose, number)
         started = time.process_time()
         mapper.add_features(number * SECOND, features, CAMERA)
-        mapper.ties()
-        mapper.camera_from_model()
+        mapper.map.overlap_reports()
+        mapper.map.camera_from_model()
         spent[number] = time.process_time() - started
-    poses = mapper.camera_from_model()
+    poses = mapper.map.camera_from_model()
     rows = []
     for minute in (minute for minute in (1.0, 3.0, 10.0) if minute <= minutes):
         near = spent[max(round(60 * minute) - WINDOW, 0) : round(60 * minute) + WINDOW]
@@ -65,7 +65,7 @@ def main(minutes: float) -> None:
     facts = {
         "registered": len(poses),
         "keyframes": count,
-        "models": mapper.models,
+        "models": len(mapper.map.models),
         "position_rmse_mm": round(
             1e3 * _rmse(np.array([_centre(pose) for pose in poses.values()]), truth[: len(poses)]), 2
         ),

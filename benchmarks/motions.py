@@ -141,8 +141,8 @@ def survive(frames: Recorded) -> dict[str, Any]:
     return {
         "frames": len(frames),
         "keyframes": len(stamps),
-        "registered": mapper.registered,
-        "models": mapper.models,
+        "registered": len(mapper.map.published),
+        "models": len(mapper.map.models),
         "longest time without [s]": round(float(np.diff(stamps).max()) / SECOND, 2),
     }
 
@@ -163,7 +163,7 @@ def mapped(frames: Recorded, camera: Camera) -> tuple[list[int], Mapper]:
             else:
                 keyframes.discard(decision.stamp)
                 mapper.retire([decision.stamp])
-            changes.extend(stream.answer(_ties(mapper)))
+            changes.extend(stream.answer(_overlaps(mapper)))
 
     for stamp, encoded in frames:
         ring.add(EncodedFrame(stamp, "camera", encoded, camera))
@@ -178,10 +178,17 @@ def mapped(frames: Recorded, camera: Camera) -> tuple[list[int], Mapper]:
     return sorted(keyframes), mapper
 
 
-def _ties(mapper: Mapper) -> list[OverlapReport]:
+def _overlaps(mapper: Mapper) -> list[OverlapReport]:
     return [
-        OverlapReport(tie.stamp, tie.registered, tie.overlap, tie.cell_overlap, tie.matches_previous, tie.matches_next)
-        for tie in mapper.ties()
+        OverlapReport(
+            report.stamp,
+            report.registered,
+            report.overlap,
+            report.cell_overlap,
+            report.matches_previous,
+            report.matches_next,
+        )
+        for report in mapper.map.overlap_reports()
     ]
 
 

@@ -94,7 +94,7 @@ def ours(images: Images, camera: Camera) -> dict[int, FloatArray]:
     for number, image in enumerate(images):
         mapper.add(number, image, camera)
     mapper.finish()
-    return {number: -pose[:3, :3].T @ pose[:3, 3] for number, pose in mapper.camera_from_model().items()}
+    return {number: -pose[:3, :3].T @ pose[:3, 3] for number, pose in mapper.map.camera_from_model().items()}
 
 
 def colmap(images: Images, camera: Camera) -> dict[int, FloatArray]:

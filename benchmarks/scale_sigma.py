@@ -81,8 +81,8 @@ def measure(recording: Recording, config: SfmConfig) -> tuple[ScaleEstimate, flo
         tracker.add(frame.stamp, gray, bag.camera)
         mapper.add(frame.stamp, gray, bag.camera)
     mapper.finish()
-    poses = mapper.camera_from_model()
-    estimate = tracker.estimate(poses, partial(mapper.covariance, next(iter(poses))))
+    poses = mapper.map.camera_from_model()
+    estimate = tracker.estimate(poses, partial(mapper.map.covariance, next(iter(poses))))
     camera_to_world = dict(
         zip(stamps, json.loads(recording.beside("truth.json").read_text())["camera_to_world"], strict=True)
     )

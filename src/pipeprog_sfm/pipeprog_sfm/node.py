@@ -211,12 +211,12 @@ class SfmNode(Node):
         self._answered += isinstance(event, KeyframeDone | Retired)
         if isinstance(event, KeyframeDone):
             self._done += 1
-            self._publish_overlap(messages.header(event.stamp, self._frame_ids[event.stamp]), event.ties)
+            self._publish_overlap(messages.header(event.stamp, self._frame_ids[event.stamp]), event.overlaps)
             if event.trajectory is not None:
                 self._publish_poses(event.trajectory)
         elif isinstance(event, Retired):
             self._retired += 1
-            self._publish_overlap(self._retiring.popleft().header, event.ties)
+            self._publish_overlap(self._retiring.popleft().header, event.overlaps)
         elif isinstance(event, MapReady):
             self._revision += 1
             self._publish_map(event.map)
@@ -252,7 +252,7 @@ class SfmNode(Node):
         if self._finish_sent:
             self._worker.send(Finish(self._take_motion(), self._colmap))
 
-    def _publish_overlap(self, header: Header, ties: list[OverlapReport]) -> None:
+    def _publish_overlap(self, header: Header, reports: list[OverlapReport]) -> None:
         self._overlap.publish(
             msg.ImageOverlapArray(
                 header=header,
@@ -260,16 +260,16 @@ class SfmNode(Node):
                 retirements_considered=self._retired,
                 images=[
                     msg.ImageOverlap(
-                        stamp=messages.time_msg(tie.stamp),
-                        registered=tie.registered,
-                        overlap=tie.overlap,
-                        cell_overlap=tie.cell_overlap,
-                        tie_points=tie.tie_points,
-                        features=tie.features,
-                        matches_previous=tie.matches_previous,
-                        matches_next=tie.matches_next,
+                        stamp=messages.time_msg(report.stamp),
+                        registered=report.registered,
+                        overlap=report.overlap,
+                        cell_overlap=report.cell_overlap,
+                        tie_points=report.tie_points,
+                        features=report.features,
+                        matches_previous=report.matches_previous,
+                        matches_next=report.matches_next,
                     )
-                    for tie in ties
+                    for report in reports
                 ],
             )
         )

@@ -18,7 +18,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
-from pipeprog_sfm.dense.dense_mapper import DenseMapper, EncodedImage, centre
+from pipeprog_sfm.dense.dense_mapper import DenseMapper, centre
 from pipeprog_sfm.dense.depth_fusion import FusedCloud
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import NoScaleError, ScaleEstimate
@@ -26,6 +26,7 @@ from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.sparse.overlap import OverlapReport
+from pipeprog_sfm.types import EncodedImage
 
 
 class NotMetricError(Exception):
@@ -75,8 +76,9 @@ class Reconstruction:
 
     def __init__(self, config: SfmConfig, board_file: BoardFile) -> None:
         self._mapper = Mapper(config.mapper, config.seed)
+        self._map = self._mapper.map
         self._config = config
-        self._deblurrer = Deblurrer(config, self._mapper)
+        self._deblurrer = Deblurrer(config)
         self._metric_tracker = MetricTracker(board_file, config.board, config.odometry)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
@@ -102,13 +104,15 @@ class Reconstruction:
         # Features and boards are measured in the image as it is: their points are undistorted, not resampled.
         self._sightings += bool(self._metric_tracker.add(stamp, gray, camera, frame))
         report = self._mapper.add(stamp, gray, camera)
-        self._deblurrer.add(stamp, self._images[stamp])
+        poses = self._map.camera_from_model()
+        for other, features in self._deblurrer.deblurred(stamp, self._images[stamp], poses, self._map.points_seen):
+            self._mapper.replace_features(other, features)
         return report
 
     def update_dense(self) -> None:
         """Starts the depth maps that can be made by now; they are worked off in a thread of their own."""
-        poses = self._mapper.camera_from_model()
-        self._dense.update(poses, self._images, self._mapper.points_seen, complete=False)
+        poses = self._map.camera_from_model()
+        self._dense.update(poses, self._images, self._map.points_seen, complete=False)
 
     def move(self, motion: RobotMotion) -> None:
         """Takes what odometry, TF and IMU have told since the last call."""
@@ -134,14 +138,14 @@ class Reconstruction:
         """Registers what still can be, adjusts everything, and makes the final map; raises NotMetricError."""
         self._mapper.finish()
         self._scaled = -1
-        self._dense.update(self._mapper.camera_from_model(), self._images, self._mapper.points_seen, complete=True)
+        self._dense.update(self._map.camera_from_model(), self._images, self._map.points_seen, complete=True)
         self._request(complete=True)
         return self._take()
 
     def write_colmap(self, folder: Path) -> None:
         """The sparse model in `map` for COLMAP, binary and as text; images are named by their stamps [ns]."""
         scale, trajectory = self._metric()
-        points, seen = self._mapper.observations()
+        points, seen = self._map.observations()
         poses = dict(zip(trajectory.stamps.tolist(), np.linalg.inv(trajectory.map_from_camera), strict=True))
         views = [
             ModelView(f"{stamp}.jpg", self._images[stamp].camera, poses[stamp], pixels, rows)
@@ -149,25 +153,25 @@ class Reconstruction:
         ]
         write_model(folder, views, points @ scale.map_from_model[:3, :3].T + scale.map_from_model[:3, 3])
 
-    def ties(self) -> list[OverlapReport]:
+    def overlap_reports(self) -> list[OverlapReport]:
         """Overlap of the keyframes that changed since the last call (Eq. 1)."""
-        return self._mapper.ties()
+        return self._map.overlap_reports()
 
     def status(self) -> Status:
         """Health so far."""
         message = self._problem or ("; ".join(self._scale.warnings) if self._scale else self._reason)
-        if self._mapper.models > 1:
-            elsewhere = self._mapper.seen - self._mapper.waiting - self._mapper.registered
+        if len(self._map.models) > 1:
+            elsewhere = len(self._map.keyframes) - len(self._map.waiting) - len(self._map.published)
             message = "; ".join(
                 [message] * bool(message)
                 + [f"{elsewhere} keyframes are not connected with the map: film what lies between once more"]
             )
         return Status(
-            self._mapper.seen,
-            self._mapper.registered,
-            self._mapper.waiting,
-            self._mapper.models,
-            self._mapper.reprojection_error,
+            len(self._map.keyframes),
+            len(self._map.published),
+            len(self._map.waiting),
+            len(self._map.models),
+            self._map.reprojection_error(),
             self._scale,
             message,
         )
@@ -192,7 +196,7 @@ class Reconstruction:
     def _request(self, complete: bool) -> None:
         scale, trajectory = self._metric()
         camera_from_map = dict(zip(trajectory.stamps.tolist(), np.linalg.inv(trajectory.map_from_camera), strict=True))
-        cloud = self._dense.fuse(camera_from_map, self._mapper.camera_from_model(), scale.scale, complete)
+        cloud = self._dense.fuse(camera_from_map, self._map.camera_from_model(), scale.scale, complete)
         self._pending = scale, trajectory, cloud
 
     def _take(self) -> MetricMap:
@@ -202,7 +206,7 @@ class Reconstruction:
         points = cloud.result()
         if not len(points.points):
             self._reason = (
-                f"no surface is seen by {self._config.fusion.min_views} of {self._mapper.registered} keyframes alike: "
+                f"no surface is seen by {self._config.fusion.min_views} of {len(self._map.published)} keyframes alike: "
                 "walk past it, sideways, or have more keyframes chosen (frames.overlap_min)"
             )
             raise NotMetricError(self._reason)
@@ -211,15 +215,15 @@ class Reconstruction:
     def _metric(self) -> tuple[ScaleEstimate, Trajectory]:
         """The scale, estimated again when the map has moved or more of the boards was seen, and the metric poses."""
         # Its cost grows with the map: a pose must not wait for it at every keyframe in sight of a board.
-        moved = self._scaled != self._mapper.revision
+        moved = self._scaled != self._map.revision
         if self._scale is None or moved or self._sightings >= self._due:
             self._estimate_scale()
-            self._scaled, self._due = self._mapper.revision, GROWTH * (self._sightings + 1)
+            self._scaled, self._due = self._map.revision, GROWTH * (self._sightings + 1)
         if self._scale is None:
             raise NotMetricError(self._reason)
         poses = {
             stamp: _metric_pose(pose, self._scale.map_from_model)
-            for stamp, pose in self._mapper.camera_from_model().items()
+            for stamp, pose in self._map.camera_from_model().items()
         }
         map_from_camera = np.stack([np.linalg.inv(pose) for pose in poses.values()])
         trajectory = Trajectory(np.array(list(poses), np.int64), map_from_camera)
@@ -228,23 +232,24 @@ class Reconstruction:
     def _estimate_scale(self) -> None:
         """Publishes the largest model that has a scale; the reason is that of the largest one."""
         self._scale = None
-        pieces = self._mapper.pieces()
-        if not pieces:
+        models = sorted(self._map.models, key=len, reverse=True)
+        if not models:
             self._reason = (
-                f"none of {self._mapper.seen} keyframes could be placed: "
+                f"none of {len(self._map.keyframes)} keyframes could be placed: "
                 "film textured surroundings while moving sideways, and check the calibration"
             )
-        for number, piece in enumerate(pieces):
-            first = next(iter(piece))
+        for number, model in enumerate(models):
+            poses = model.poses()
+            first = next(iter(poses))
             try:
                 self._scale = self._metric_tracker.estimate(
-                    piece, partial(self._mapper.covariance, first), partial(self._mapper.points, first)
+                    poses, partial(self._map.covariance, first), partial(self._map.points, first)
                 )
             except NoScaleError as error:
                 if number == 0:
                     self._reason = str(error)
                 continue
-            self._mapper.publish(first)
+            self._map.publish(first)
             return
 
 

@@ -32,6 +32,6 @@ def warm_up(config: SfmConfig) -> None:
         pose[0, 3] = -number * STEP / camera.fx
         views.append(StereoImage(number, image, camera, pose))
         reconstruction.add(number, cv2.imencode(".png", image)[1].tobytes(), camera)
-        reconstruction.ties()
+        reconstruction.overlap_reports()
     maps = [depth_map(view, [other for other in views if other is not view], DEPTHS, config.stereo) for view in views]
     fuse(maps, {view.stamp: view.camera_from_world for view in views}, 1.0, config.fusion)

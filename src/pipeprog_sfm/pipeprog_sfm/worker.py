@@ -59,7 +59,7 @@ class KeyframeDone:
 
     stamp: int
     status: Status
-    ties: list[OverlapReport]
+    overlaps: list[OverlapReport]
     trajectory: Trajectory | None
 
 
@@ -68,7 +68,7 @@ class Retired:
     """Event: a Retire is worked off."""
 
     status: Status
-    ties: list[OverlapReport]
+    overlaps: list[OverlapReport]
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def _answer(reconstruction: Reconstruction, command: AddKeyframe | Retire) -> Ke
     if isinstance(command, AddKeyframe):
         return _add(reconstruction, command)
     reconstruction.retire(command.stamps)
-    return Retired(reconstruction.status(), reconstruction.ties())
+    return Retired(reconstruction.status(), reconstruction.overlap_reports())
 
 
 def _add(reconstruction: Reconstruction, keyframe: AddKeyframe) -> KeyframeDone:
@@ -144,7 +144,7 @@ def _add(reconstruction: Reconstruction, keyframe: AddKeyframe) -> KeyframeDone:
     trajectory = None
     with contextlib.suppress(NotMetricError):  # the status tells
         trajectory = reconstruction.trajectory()
-    return KeyframeDone(keyframe.stamp, reconstruction.status(), reconstruction.ties(), trajectory)
+    return KeyframeDone(keyframe.stamp, reconstruction.status(), reconstruction.overlap_reports(), trajectory)
 
 
 def _finish(connection: Connection, reconstruction: Reconstruction, colmap: str) -> Finished:

@@ -35,7 +35,7 @@ class Prompt:
     def status(self) -> str:
         return "well"
 
-    def ties(self) -> list[object]:
+    def overlap_reports(self) -> list[object]:
         return []
 
     def request_map(self) -> None:

@@ -19,6 +19,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
 from pipeprog_sfm.dense.stereo import DepthMap, StereoImage, choose_pairs, depth_map, working_image
+from pipeprog_sfm.types import EncodedImage
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
 SUBMITTED = 2  # depth maps that stand before a fusion in the queue: more would only make the map wait
@@ -28,14 +29,6 @@ MIN_POINTS = 10  # of a keyframe, to know the range of its depths
 SAMPLE = 200  # of them, to know what other keyframes see of the same
 SAME_SIDE = np.radians(8.0)  # of a surface: farther round (0.14 of the depth), a view is a witness of its own
 SAME_SCALE = 1.5  # of an image: from nearer, more is to be seen
-
-
-@dataclass(frozen=True)
-class EncodedImage:
-    """A keyframe as it came: JPEG or PNG bytes, and its calibration."""
-
-    data: bytes
-    camera: Camera
 
 
 @dataclass(frozen=True)

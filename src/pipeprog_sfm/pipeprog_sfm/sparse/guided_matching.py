@@ -27,12 +27,10 @@ def link(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> No
     depth = depth[depth > 0]
     if not len(depth):
         return
-    near, far = 0.5 * np.percentile(depth, 2), 2.0 * np.percentile(depth, 98)
-    mine = keyframes[model.stamps[view]]
+    depth_range = float(0.5 * np.percentile(depth, 2)), float(2.0 * np.percentile(depth, 98))
     features, others = [], []
-    for other in partners(model, view, mine.camera):
-        theirs = keyframes[model.stamps[other]]
-        found = _match_guided(model, view, mine, other, theirs, float(near), float(far))
+    for other in partners(model, view, keyframes[model.stamps[view]].camera):
+        found = _match_guided(model, view, other, keyframes, depth_range)
         features.append(found[:, 0] + model.offsets[view])
         others.append(found[:, 1] + model.offsets[other])
     if not features:
@@ -70,13 +68,14 @@ def partners(model: SparseModel, view: int, camera: Camera) -> list[int]:
 
 
 def _match_guided(
-    model: SparseModel, view: int, mine: Keyframe, other: int, theirs: Keyframe, near: float, far: float
+    model: SparseModel, view: int, other: int, keyframes: Mapping[int, Keyframe], depth_range: tuple[float, float]
 ) -> MatchArray:
-    """Matches along the epipolar segment between two depths; a feature with a point is looked for at its place."""
+    """Matches along the epipolar segment between two depths; a feature with a point is sought near its projection."""
+    mine, theirs = keyframes[model.stamps[view]], keyframes[model.stamps[other]]
     rotation = model.rotation[other] @ model.rotation[view].T
     translation = model.translation[other] - rotation @ model.translation[view]
-    low = np.full(len(mine.rays), near)
-    high = np.full(len(mine.rays), far)
+    low = np.full(len(mine.rays), depth_range[0])
+    high = np.full(len(mine.rays), depth_range[1])
     own = model.point_of[model.features(view)]
     has = own >= 0
     depth = model.points[own[has]] @ model.rotation[view, 2] + model.translation[view, 2]

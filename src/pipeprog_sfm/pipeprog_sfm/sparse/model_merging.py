@@ -1,14 +1,52 @@
-"""Two models made one, by a keyframe that has a place in both."""
+"""Two models merged by a keyframe that can be located in both."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_sfm.sparse.registration import MIN_INLIERS, Location
+from pipeprog_sfm.sparse.guided_matching import link
+from pipeprog_sfm.sparse.localizer import Localizer
+from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS, Location
+from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 DEPTH_TOLERANCE = 0.05  # of a point's depth in two models: its noise at the smallest angle
+
+
+def merge_models(sparse_map: SparseMap, localizer: Localizer, stamp: int) -> None:
+    """Merges the keyframe's model with another one in which the keyframe can be located as well."""
+    own = sparse_map.model_of(stamp)
+    if own is None:
+        return
+    keyframe = sparse_map.keyframes[stamp]
+    for other in [model for model in sparse_map.models if model is not own]:
+        similar = localizer.next_similar_views(other, keyframe)
+        if not len(similar):
+            continue
+        location = localizer.locate_by(other, keyframe, similar)
+        found = similarity_between(own, own.stamps.index(stamp), other, location)
+        if found is not None:
+            removed, merged = merge(own, other, *found)
+            sparse_map.models = [model for model in sparse_map.models if model is not removed]
+            _connect(sparse_map, removed, merged, stamp)
+            return
+
+
+def _connect(sparse_map: SparseMap, removed: SparseModel, merged: SparseModel, stamp: int) -> None:
+    """Matches the views of the removed model with those of the merged one, and adjusts it.
+
+    First the views nearest in time to the keyframe that both models saw: only there do the poses agree well enough
+    for guided matching before the first adjustment.
+    """
+    near = sorted(range(len(merged)), key=lambda view: abs(merged.stamps[view] - stamp))[: 2 * LOCAL_WINDOW]
+    for view in near:
+        link(merged, view, sparse_map.keyframes)
+    sparse_map.adjust_globally(merged)
+    for moved in removed.stamps:
+        if moved in merged.stamps:
+            link(merged, merged.stamps.index(moved), sparse_map.keyframes)
+    sparse_map.adjust_globally(merged)
 
 
 def similarity_between(

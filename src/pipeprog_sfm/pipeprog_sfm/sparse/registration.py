@@ -12,6 +12,7 @@ from pipeprog_sfm.sparse.colmap import AbsolutePose, absolute_pose
 from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import MatchArray
+from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_views
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 POSE_ERROR = 4.0  # px, for RANSAC: the map's points move by a pixel or two before they are adjusted
@@ -72,7 +73,7 @@ def rejection_reason(model: SparseModel, view: int, matches: Mapping[int, MatchA
     if tied < MIN_INLIERS:
         return f"only {tied} points hold its pose"
     errors = [
-        model.epipolar_errors(view, model.stamps.index(other), found)
+        epipolar_errors(model, view, model.stamps.index(other), found)
         for other, found in matches.items()
         if other in model.stamps
     ]
@@ -81,6 +82,18 @@ def rejection_reason(model: SparseModel, view: int, matches: Mapping[int, MatchA
     if share < MIN_SHARE:
         return f"only {share:.0%} of the matches with its neighbours agree with its pose"
     return ""
+
+
+def epipolar_errors(model: SparseModel, view: int, other: int, matches: MatchArray) -> FloatArray:
+    """Distances in px of the features of `other` from the epipolar lines of those of `view`; matches (M, 2)."""
+    rotation = model.rotation[other] @ model.rotation[view].T
+    tx, ty, tz = model.translation[other] - rotation @ model.translation[view]
+    essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ rotation
+    own = model.rays[model.offsets[view] + matches[:, 0]]
+    theirs = model.rays[model.offsets[other] + matches[:, 1]]
+    line = np.c_[own, np.ones(len(own))] @ essential.T
+    residual = (line * np.c_[theirs, np.ones(len(theirs))]).sum(axis=1)
+    return np.abs(residual) / np.maximum(np.hypot(*(line[:, :2] / model.focal[other]).T), 1e-12)
 
 
 def _absolute_pose(model: SparseModel, keyframe: Keyframe, pairs: IntArray, seed: int) -> AbsolutePose | None:
@@ -94,6 +107,6 @@ def _adjust_around(model: SparseModel, view: int) -> None:
     window = np.argsort(-shared, kind="stable")[: LOCAL_WINDOW - 1]
     window = np.append(window[shared[window] > 0], view)
     if len(model) <= LOCAL_WINDOW:
-        model.adjust(None, 10, 1e-3)
+        adjust_model(model)
     else:
-        model.adjust(window, 10, 1e-3)
+        adjust_views(model, window)

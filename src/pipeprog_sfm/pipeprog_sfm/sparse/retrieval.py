@@ -1,25 +1,35 @@
-"""Keyframes that show the same: their matches, found once, and those out of many that look alike."""
+"""Image retrieval: which of many keyframes show the same as a given one, by the number of matches."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import IntArray
 from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import MatchArray, match
 
-PAIRS_REMEMBERED = 2000  # of keyframes, whose matches are kept: 10 MB
-RETRIEVED = 6  # views of a model that a lost keyframe is compared with, others each time: the cost stays bounded
-ALIKE = 3  # of these that are matched in full
-GLANCE = 400  # features that such a comparison takes
+PAIRS_REMEMBERED = 2000  # pairs of keyframes whose matches are kept: 10 MB
+SUBSET = 6  # views of a model that a keyframe is compared with at a time: the cost does not grow with the model
+SIMILAR = 3  # of these that are then matched in full
+PREVIEW = 400  # strongest features that such a comparison takes: a hundredth of the cost of all 4000
+COARSE = 1500  # strongest features matched without a prediction of the pose: enough for one, a seventh of the cost
 
 
 class Retrieval:
-    """Matches of pairs of keyframes, and the views that look like a keyframe."""
+    """Matches of pairs of keyframes, each found once, and the search for keyframes that look alike.
 
-    def __init__(self) -> None:
+    `match_pair` (as `match`) and `remembered` (pairs whose matches are kept) are given by tests only.
+    """
+
+    def __init__(
+        self,
+        match_pair: Callable[[NDArray[np.uint8], NDArray[np.uint8]], MatchArray] = match,
+        remembered: int = PAIRS_REMEMBERED,
+    ) -> None:
+        self._match, self._remembered = match_pair, remembered
         self._matches: dict[tuple[int, int, int | None], MatchArray] = {}
         self._cursor = 0
 
@@ -27,23 +37,26 @@ class Retrieval:
         """Matches of the `count` strongest features (None: of all) of two keyframes, found once."""
         pair = keyframe.stamp, other.stamp, count
         if pair not in self._matches:
-            self._matches[pair] = match(keyframe.features.descriptors[:count], other.features.descriptors[:count])
-            while len(self._matches) > PAIRS_REMEMBERED:
+            self._matches[pair] = self._match(keyframe.features.descriptors[:count], other.features.descriptors[:count])
+            while len(self._matches) > self._remembered:
                 del self._matches[next(iter(self._matches))]
         return self._matches[pair]
 
     def forget(self, stamp: int) -> None:
-        """A keyframe that gets other features is matched anew."""
+        """Drops the matches of a keyframe that gets other features."""
         self._matches = {pair: found for pair, found in self._matches.items() if stamp not in pair[:2]}
 
-    def turn(self, count: int) -> IntArray:
-        """The few out of `count` that it is the turn of, spread evenly; others each time."""
-        chosen = (self._cursor + np.arange(min(RETRIEVED, count)) * max(count // RETRIEVED, 1)) % count
+    def next_subset(self, count: int) -> IntArray:
+        """Round-robin subset of `count` indices, evenly spaced; successive calls return different ones."""
+        chosen = (self._cursor + np.arange(min(SUBSET, count)) * max(count // SUBSET, 1)) % count
         self._cursor += 1
         return chosen
 
-    def resembling(self, keyframe: Keyframe, others: Sequence[Keyframe], least: int) -> IntArray:
-        """Which of the others share most of the strongest features, and at least so many; the best first."""
-        found = np.array([len(self.matches(keyframe, other, GLANCE)) for other in others], np.int64)
-        order = np.argsort(-found, kind="stable")[:ALIKE]
-        return order[found[order] >= least]
+    def most_similar(self, keyframe: Keyframe, others: Sequence[Keyframe], min_matches: int) -> IntArray:
+        """Indices of up to SIMILAR others with most matches among the PREVIEW strongest features, the best first.
+
+        Those with fewer than `min_matches` matches are left out.
+        """
+        found = np.array([len(self.matches(keyframe, other, PREVIEW)) for other in others], np.int64)
+        order = np.argsort(-found, kind="stable")[:SIMILAR]
+        return order[found[order] >= min_matches]

@@ -12,13 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covariance
 from pipeprog_sfm.sparse.tracks import NONE, digests, extend, filter_tracks, triangulate
 
 MAX_ERROR = 3.0  # px: the noise of SIFT is below 1 px, wrong matches are uniform in the search range
-NOISE_RANGE = (0.1, 1.0)  # px, of a coordinate: what image noise and SIFT's localisation allow
-CAUCHY = 2.385  # scale of the loss in standard deviations for 95 % efficiency under normal noise (Holland, Welsch 1977)
-RAYLEIGH_MEDIAN = 1.1774  # of an error's length, in standard deviations of a coordinate
+INITIAL_NOISE = 1.0  # px, of a coordinate, before it can be estimated: more than SIFT has
 MIN_ANGLE = np.radians(1.5)  # between the rays of a point: depth is known to a few per cent at 0.5 px
 
 
@@ -36,7 +33,7 @@ class SparseModel:
         self.translation: FloatArray = np.empty((0, 3))
         self.focal: FloatArray = np.empty((0, 2))
         self.points: FloatArray = np.empty((0, 3))
-        self.noise = NOISE_RANGE[1]
+        self.noise = INITIAL_NOISE
         self.adjusted_at = 2  # views at the last global adjustment
         self._rays: FloatArray = np.empty((0, 2))
         self._view_of: NDArray[np.int32] = np.empty(0, np.int32)
@@ -157,17 +154,6 @@ class SparseModel:
             point = other.point_of[own]
             self.point_of[self.features(new)] = np.where(point >= 0, point + first_point, NONE)
 
-    def epipolar_errors(self, view: int, other: int, matches: NDArray[np.int32]) -> FloatArray:
-        """Distances in px of the features of `other` from the epipolar lines of those of `view`; matches (M, 2)."""
-        rotation = self.rotation[other] @ self.rotation[view].T
-        tx, ty, tz = self.translation[other] - rotation @ self.translation[view]
-        essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ rotation
-        own = self.rays[self.offsets[view] + matches[:, 0]]
-        theirs = self.rays[self.offsets[other] + matches[:, 1]]
-        line = np.c_[own, np.ones(len(own))] @ essential.T
-        residual = (line * np.c_[theirs, np.ones(len(theirs))]).sum(axis=1)
-        return np.abs(residual) / np.maximum(np.hypot(*(line[:, :2] / self.focal[other]).T), 1e-12)
-
     def observations(self, points: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
         """Features that see the chosen points (mask over the points), sorted by point.
 
@@ -193,52 +179,13 @@ class SparseModel:
         shared[view] = 0
         return shared
 
-    def adjust(self, views: IntArray | None, max_iterations: int, tolerance: float) -> None:
-        """Bundle adjustment of all views (None; the first stays fixed), or of some and the points that these see."""
-        free = np.zeros(len(self), bool)
-        chosen = np.ones(len(self.points), bool)
-        if views is None:
-            free[1:] = True
-        else:
-            free[views] = True
-            free[0] = False
-            chosen[:] = False
-            chosen[np.concatenate([self.seen(view) for view in views])] = True
-        ids, start, features = self.observations(chosen)
-        if not len(ids):
-            return
-        used, view = np.unique(self.view_of[features], return_inverse=True)
-        bundle = Bundle(
-            self.rotation[used], self.translation[used], self.points[ids],
-            start, view.astype(np.int64), self.rays[features], self.focal[used],
-        )  # fmt: skip
-        loss_scale = CAUCHY * self.noise
-        adjusted = adjust(
-            bundle, free[used], loss_scale=loss_scale, max_iterations=max_iterations, tolerance=tolerance
-        ).bundle
-        self.rotation[used], self.translation[used] = adjusted.rotation, adjusted.translation
-        self.points[ids] = adjusted.points
-        if views is None:
-            error = float(np.median(self.errors(features))) / RAYLEIGH_MEDIAN
-            self.noise = min(max(error, NOISE_RANGE[0]), NOISE_RANGE[1])
-        self.filter(ids, start, features)
-        if views is None:
-            self._forget_unseen()
-
-    def _forget_unseen(self) -> None:
-        """Numbers the points anew, without those that no view sees."""
+    def forget_unseen(self) -> None:
+        """Removes the points that no view sees, and numbers the others anew."""
         alive = np.zeros(len(self.points), bool)
         alive[self.point_of[self.point_of >= 0]] = True
         number = np.append(np.cumsum(alive) - 1, NONE)  # NONE indexes the last one
         self.point_of[:] = number[self.point_of]
         self.points = self.points[alive]
-
-    def covariance(self, gradients: FloatArray) -> FloatArray:
-        """(S, S) covariance of functions of the poses whose derivatives are (S, V, 6): see `function_covariance`."""
-        ids, start, features = self.observations(np.ones(len(self.points), bool))
-        view = self.view_of[features].astype(np.int64)
-        bundle = Bundle(self.rotation, self.translation, self.points[ids], start, view, self.rays[features], self.focal)
-        return function_covariance(gradients, bundle, loss_scale=CAUCHY * self.noise)
 
     def filter(self, ids: IntArray, start: IntArray, features: IntArray) -> None:
         """Drops observations with a large error or behind the camera, second ones of a view, and thin points."""

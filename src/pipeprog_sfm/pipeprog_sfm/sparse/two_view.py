@@ -8,10 +8,12 @@ from pipeprog_sfm.sparse.colmap import relative_pose
 from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import MatchArray
+from pipeprog_sfm.sparse.model_adjustment import adjust_model
 from pipeprog_sfm.sparse.registration import POSE_ERROR
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
-START_POINTS = 40  # of a new model
+START_POINTS = 40  # of a new model: twice the inliers that a pose must have
+START_ITERATIONS, START_TOLERANCE = 20, 1e-4  # of the adjustment: farther from the minimum than a map that grows
 START_ANGLE = np.radians(3.0)  # median between the rays of its points
 
 
@@ -32,9 +34,9 @@ def model_from_pair(first: Keyframe, second: Keyframe, matches: MatchArray, seed
     pairs = matches[pose.inliers].astype(np.int64)
     pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
     model.link(pairs[:, 1] + model.offsets[view], pairs[:, 0])
-    model.adjust(None, 20, 1e-4)
+    adjust_model(model, START_ITERATIONS, START_TOLERANCE)
     link(model, view, {first.stamp: first, second.stamp: second})
-    model.adjust(None, 20, 1e-4)
+    adjust_model(model, START_ITERATIONS, START_TOLERANCE)
     ids, _, _ = model.observations(np.ones(len(model.points), bool))
     if len(ids) < START_POINTS:
         return None

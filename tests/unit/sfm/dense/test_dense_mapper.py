@@ -8,7 +8,8 @@ import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
-from pipeprog_sfm.dense.dense_mapper import DenseMapper, EncodedImage, overlap
+from pipeprog_sfm.dense.dense_mapper import DenseMapper, overlap
+from pipeprog_sfm.types import EncodedImage
 
 WIDTH, HEIGHT = 240, 160
 CAMERA = Camera(WIDTH, HEIGHT, 220.0, 220.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)

@@ -1,4 +1,4 @@
-"""A loop closed on a chain of views: who moves, and how far."""
+"""Loop closure on a chain of views: which views move, and how far."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scenes import POINTS, VIEWS, sparse_model
 
-import pipeprog_sfm.sparse.loop_closure as loop_module
 from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
 from pipeprog_sfm.sparse.loop_closure import correction_weights, distribute_correction, is_drift, loop_candidates
 from pipeprog_sfm.sparse.sparse_model import NONE
@@ -17,14 +16,14 @@ CORRECTION[:3, :3] = rotation_from_vector(np.array([[0.0, 0.02, 0.01]]))[0]
 CORRECTION[:3, 3] = [0.0, 0.02, 0.0]
 
 
-def test_views_that_are_tied_alike_take_half_of_a_correction() -> None:
+def test_views_that_share_as_many_points_take_half_of_a_correction() -> None:
     # Each of six views sees all points.
     assert correction_weights(sparse_model(), np.array([0]), VIEWS - 1) == pytest.approx(
         [0.0, *[0.5] * (VIEWS - 2), 1.0], abs=1e-6
     )
 
 
-def test_a_whole_share_for_all_is_the_similarity_itself() -> None:
+def test_a_weight_of_one_for_all_is_the_similarity_itself() -> None:
     model = sparse_model()
     points, centres = model.points.copy(), model.centres()
     distribute_correction(model, np.ones(VIEWS), SCALE, CORRECTION)
@@ -33,7 +32,7 @@ def test_a_whole_share_for_all_is_the_similarity_itself() -> None:
     assert model.errors(np.arange(VIEWS * POINTS)).max() < 1e-6
 
 
-def test_views_move_by_their_shares_and_points_with_who_saw_them_first() -> None:
+def test_views_move_by_their_weights_and_points_with_who_saw_them_first() -> None:
     model = sparse_model()
     points, centres = model.points.copy(), model.centres()
     distribute_correction(model, np.array([0.0, 0, 0, 0.5, 1, 1]), 1.0, CORRECTION)
@@ -45,16 +44,15 @@ def test_views_move_by_their_shares_and_points_with_who_saw_them_first() -> None
 
 
 @pytest.mark.parametrize(("metres", "drifted"), [(0.01, True), (0.2, False)])
-def test_drift_is_small_beside_the_way(metres: float, drifted: bool) -> None:
+def test_drift_is_small_against_the_path(metres: float, drifted: bool) -> None:
     shift = np.eye(4)
     shift[1, 3] = metres  # the views stand along 1 m
     assert is_drift(sparse_model(), VIEWS - 1, 0, 1.0, shift) == drifted
 
 
-def test_views_of_long_ago_matter_while_nothing_ties_to_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distant_views_are_candidates_while_no_point_is_shared_with_them() -> None:
     model = sparse_model()
-    assert not len(loop_candidates(model, VIEWS - 1)), "six views are no long time"
-    monkeypatch.setattr(loop_module, "LOCAL_WINDOW", 1)
-    assert not len(loop_candidates(model, VIEWS - 1)), "they share all points"
+    assert not len(loop_candidates(model, VIEWS - 1)), "all six views are within the window"
+    assert not len(loop_candidates(model, VIEWS - 1, window=1)), "they share all points"
     model.point_of[model.features(VIEWS - 1)] = NONE
-    assert loop_candidates(model, VIEWS - 1).tolist() == [0, 1, 2]
+    assert loop_candidates(model, VIEWS - 1, window=1).tolist() == [0, 1, 2]

@@ -9,13 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scenes import CAMERA, STEP, blurred, centre, pose, position_errors, ring_pose, ring_view, view
 
-import pipeprog_sfm.sparse.mapper as mapper_module
-import pipeprog_sfm.sparse.retrieval as retrieval_module
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.sparse.features import Features, root_sift
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.matching import match
+from pipeprog_sfm.sparse.retrieval import Retrieval
 
 POSITION_TOLERANCE = 0.003  # m at 2 m from the wall: some ten times the noise of a camera held by 300 points
 
@@ -37,38 +36,41 @@ def straight() -> tuple[Mapper, dict[int, NDArray[Any]]]:
 
 def test_every_keyframe_is_registered_where_it_was(straight: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
     mapper, truth = straight
-    poses = mapper.camera_from_model()
+    poses = mapper.map.camera_from_model()
     assert list(poses) == sorted(truth)
-    assert (mapper.seen, mapper.waiting, mapper.models) == (len(truth), 0, 1)
+    assert (len(mapper.map.keyframes), len(mapper.map.waiting), len(mapper.map.models)) == (len(truth), 0, 1)
     assert position_errors(poses, truth).max() < POSITION_TOLERANCE
     # A coordinate's noise of 0.3 px makes errors of 0.38 px on average.
-    assert 0.25 < mapper.reprojection_error < 0.45
+    assert 0.25 < mapper.map.reprojection_error() < 0.45
 
 
-def test_ties_are_told_once_and_again_when_they_change() -> None:
+def test_overlap_is_reported_once_and_again_when_it_changes() -> None:
     mapper = Mapper(MapperConfig())
     for n in range(4):
         mapper.add_features(n * STEP, view(pose(0.2 * n), n), CAMERA)
-    first = {tie.stamp: tie for tie in mapper.ties()}
+    first = {report.stamp: report for report in mapper.map.overlap_reports()}
     assert sorted(first) == [0, STEP, 2 * STEP, 3 * STEP]
-    assert all(tie.registered and 0.3 < tie.overlap <= 1.0 and 0 < tie.cell_overlap <= 1.0 for tie in first.values())
+    assert all(
+        report.registered and 0.3 < report.overlap <= 1.0 and 0 < report.cell_overlap <= 1.0
+        for report in first.values()
+    )
     assert first[0].matches_previous == 0
     assert first[0].matches_next == first[STEP].matches_previous > 100
-    assert mapper.ties() == []
+    assert mapper.map.overlap_reports() == []
     mapper.add_features(4 * STEP, view(pose(0.8), 4), CAMERA)
-    assert 3 * STEP in {tie.stamp for tie in mapper.ties()}
+    assert 3 * STEP in {report.stamp for report in mapper.map.overlap_reports()}
 
 
 def test_the_same_keyframes_give_the_same_bytes() -> None:
     (first, _), (second, _) = walk(np.arange(0, 1.2, 0.2)), walk(np.arange(0, 1.2, 0.2))
-    assert first.points_seen(STEP).tobytes() == second.points_seen(STEP).tobytes()
-    for stamp, camera_from_model in first.camera_from_model().items():
-        assert camera_from_model.tobytes() == second.camera_from_model()[stamp].tobytes()
+    assert first.map.points_seen(STEP).tobytes() == second.map.points_seen(STEP).tobytes()
+    for stamp, camera_from_model in first.map.camera_from_model().items():
+        assert camera_from_model.tobytes() == second.map.camera_from_model()[stamp].tobytes()
 
 
 def test_a_texture_that_repeats_misplaces_nothing() -> None:
     mapper, truth = walk(np.arange(0, 3, 0.2), period=0.7)
-    poses = mapper.camera_from_model()
+    poses = mapper.map.camera_from_model()
     assert len(poses) == len(truth)
     assert position_errors(poses, truth).max() < POSITION_TOLERANCE
 
@@ -76,11 +78,11 @@ def test_a_texture_that_repeats_misplaces_nothing() -> None:
 def test_two_models_are_joined_when_the_camera_returns() -> None:
     away = np.r_[np.arange(0, 1.0, 0.2), np.arange(4.0, 5.0, 0.2)]
     mapper, _ = walk(away)
-    assert mapper.models == 2
-    assert len(mapper.camera_from_model()) == 5
+    assert len(mapper.map.models) == 2
+    assert len(mapper.map.camera_from_model()) == 5
     mapper, truth = walk(np.r_[away, np.arange(4.6, 0.4, -0.2)])
-    assert mapper.models == 1
-    poses = mapper.camera_from_model()
+    assert len(mapper.map.models) == 1
+    poses = mapper.map.camera_from_model()
     assert len(poses) == len(truth)
     assert position_errors(poses, truth).max() < 2 * POSITION_TOLERANCE
 
@@ -94,9 +96,9 @@ def test_a_loop_is_closed_though_the_map_has_drifted() -> None:
         truth[n * STEP] = ring_pose(n * step)
         mapper.add_features(n * STEP, ring_view(n * step, n), camera)
     mapper.finish()
-    poses = mapper.camera_from_model()
+    poses = mapper.map.camera_from_model()
     assert list(poses) == sorted(truth)
-    assert mapper.models == 1
+    assert len(mapper.map.models) == 1
     # A focal length that is off strains the map, but no gap is left: 28 px are 55 mm at 4 m from the axis.
     assert position_errors(poses, truth).max() < 3 * POSITION_TOLERANCE
     relative = poses[0] @ np.linalg.inv(poses[40 * STEP])
@@ -115,7 +117,7 @@ def test_a_keyframe_of_elsewhere_waits_and_says_why() -> None:
     report = mapper.add_features(4 * STEP, strange, CAMERA)
     assert not report.registered
     assert "agree on a pose" in report.reason
-    assert mapper.waiting == 1
+    assert len(mapper.map.waiting) == 1
     assert mapper.add_features(5 * STEP, view(pose(1.0), 5), CAMERA).registered
 
 
@@ -127,32 +129,32 @@ def test_a_keyframe_with_hardly_any_feature_waits(count: int) -> None:
         few = Features(full.keypoints[:count], full.descriptors[:count])
         assert not mapper.add_features(n * STEP, few, CAMERA).registered
     mapper.finish()
-    assert mapper.camera_from_model() == {}
-    assert mapper.reprojection_error == 0
-    assert all(not tie.registered and tie.overlap == 0 for tie in mapper.ties())
+    assert mapper.map.camera_from_model() == {}
+    assert mapper.map.reprojection_error() == 0
+    assert all(not report.registered and report.overlap == 0 for report in mapper.map.overlap_reports())
 
 
 def test_turning_on_the_spot_starts_no_model() -> None:
     mapper = Mapper(MapperConfig())
     for n in range(5):
         assert not mapper.add_features(n * STEP, view(pose(0.0, 0.05 * n), n), CAMERA).registered
-    assert mapper.models == 0
+    assert len(mapper.map.models) == 0
 
 
 def test_retired_keyframes_leave_the_map_and_the_others_stay() -> None:
     mapper, truth = walk(np.arange(0, 2, 0.1))
     retired = [n * STEP for n in range(1, 20, 2)]
-    mapper.ties()
+    mapper.map.overlap_reports()
     mapper.retire([*retired, 99])
     left = {stamp: pose for stamp, pose in truth.items() if stamp not in retired}
-    assert (mapper.seen, mapper.registered, mapper.waiting) == (len(left), len(left), 0)
-    told = mapper.ties()
-    assert [tie.stamp for tie in told] == sorted(left)
+    assert (len(mapper.map.keyframes), len(mapper.map.published), len(mapper.map.waiting)) == (len(left), len(left), 0)
+    reported = mapper.map.overlap_reports()
+    assert [report.stamp for report in reported] == sorted(left)
     # What the neighbours of old shared with those that left does not count any more.
-    assert told[0].matches_next == told[1].matches_previous > 100
+    assert reported[0].matches_next == reported[1].matches_previous > 100
     assert mapper.add_features(20 * STEP, view(pose(2.0), 20), CAMERA).registered
     mapper.finish()
-    poses = mapper.camera_from_model()
+    poses = mapper.map.camera_from_model()
     assert list(poses) == [*sorted(left), 20 * STEP]
     assert position_errors(poses, {**left, 20 * STEP: pose(2.0)}).max() < POSITION_TOLERANCE
 
@@ -162,12 +164,12 @@ def test_a_model_whose_keyframes_are_retired_is_given_up() -> None:
     for n in range(3):
         mapper.add_features(n * STEP, view(pose(0.2 * n), n), CAMERA)
     mapper.retire([0, 2 * STEP])
-    assert (mapper.seen, mapper.models, mapper.waiting) == (1, 0, 1)
+    assert (len(mapper.map.keyframes), len(mapper.map.models), len(mapper.map.waiting)) == (1, 0, 1)
     assert mapper.add_features(3 * STEP, view(pose(0.6), 3), CAMERA).registered
-    assert (mapper.models, mapper.registered) == (1, 2)
+    assert (len(mapper.map.models), len(mapper.map.published)) == (1, 2)
 
 
-def test_a_keyframe_that_comes_again_is_neither_searched_nor_matched_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_keyframe_that_comes_again_is_neither_searched_nor_matched_anew() -> None:
     extracted, matched = [], []
 
     def counted_extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Features:
@@ -179,32 +181,35 @@ def test_a_keyframe_that_comes_again_is_neither_searched_nor_matched_anew(monkey
         matched.append(len(a))
         return match(a, b)
 
-    monkeypatch.setattr(mapper_module, "extract", counted_extract)
-    monkeypatch.setattr(retrieval_module, "match", counted_match)
-    mapper = Mapper(MapperConfig())
+    mapper = Mapper(MapperConfig(), extract_features=counted_extract, retrieval=Retrieval(counted_match))
     for n in range(6):
         mapper.add(n * STEP, np.full((2, 2), n, np.uint8), CAMERA)
-    first = dict(mapper.camera_from_model())
+    first = dict(mapper.map.camera_from_model())
     mapper.retire([3 * STEP])
     matches_before = len(matched)
     assert mapper.add(3 * STEP, np.full((2, 2), 3, np.uint8), CAMERA).registered
     assert extracted == [0, 1, 2, 3, 4, 5]
     # Its neighbour of before is known; the one that has come since is not.
     assert len(matched) - matches_before == 1
-    np.testing.assert_allclose(centre(mapper.camera_from_model()[3 * STEP]), centre(first[3 * STEP]), atol=0.01)
+    np.testing.assert_allclose(centre(mapper.map.camera_from_model()[3 * STEP]), centre(first[3 * STEP]), atol=0.01)
 
 
-def test_what_is_remembered_of_retired_keyframes_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapper_module, "REMEMBERED", 2)
-    mapper = Mapper(MapperConfig())
-    monkeypatch.setattr(mapper_module, "extract", lambda gray, camera, config: pytest.fail("searched again"))
+def test_what_is_remembered_of_retired_keyframes_is_bounded() -> None:
+    extracted = []
+
+    def counted_extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Features:
+        extracted.append(int(gray[0, 0]))
+        return view(pose(0.2 * extracted[-1]), extracted[-1])
+
+    mapper = Mapper(MapperConfig(), extract_features=counted_extract, remembered=2)
     for n in range(5):
         mapper.add_features(n * STEP, view(pose(0.2 * n), n), CAMERA)
     mapper.retire([n * STEP for n in range(5)])
     for n in (3, 4):
-        mapper.add(n * STEP, np.zeros((2, 2), np.uint8), CAMERA)
-    with pytest.raises(pytest.fail.Exception, match="searched again"):
-        mapper.add(2 * STEP, np.zeros((2, 2), np.uint8), CAMERA)
+        mapper.add(n * STEP, np.full((2, 2), n, np.uint8), CAMERA)
+    assert extracted == []
+    mapper.add(2 * STEP, np.full((2, 2), 2, np.uint8), CAMERA)
+    assert extracted == [2]
 
 
 @pytest.mark.parametrize("kept", [0, 600])
@@ -215,20 +220,20 @@ def test_features_that_fit_better_are_taken(kept: int) -> None:
     for n, stamp in enumerate(truth):
         features = view(truth[stamp], n)
         mapper.add_features(stamp, blurred(features, kept) if n == 4 else features, CAMERA)
-    assert (4 * STEP in mapper.camera_from_model()) == (kept > 0)
-    assert mapper.exchange(4 * STEP, view(truth[4 * STEP], 4))
-    assert (mapper.registered, mapper.waiting) == (8, 0)
+    assert (4 * STEP in mapper.map.camera_from_model()) == (kept > 0)
+    assert mapper.replace_features(4 * STEP, view(truth[4 * STEP], 4))
+    assert (len(mapper.map.published), len(mapper.map.waiting)) == (8, 0)
     mapper.finish()
-    poses = mapper.camera_from_model()
+    poses = mapper.map.camera_from_model()
     assert list(poses) == list(truth)
     assert position_errors(poses, truth).max() < POSITION_TOLERANCE
-    ties = {tie.stamp: tie for tie in mapper.ties()}
-    assert ties[4 * STEP].matches_next > 0.7 * ties[3 * STEP].matches_previous
+    reports = {report.stamp: report for report in mapper.map.overlap_reports()}
+    assert reports[4 * STEP].matches_next > 0.7 * reports[3 * STEP].matches_previous
 
 
 def test_features_that_fit_worse_change_nothing() -> None:
     mapper, truth = walk(np.arange(0, 1.6, 0.2))
-    before = mapper.camera_from_model()
-    assert not mapper.exchange(4 * STEP, blurred(view(truth[4 * STEP], 4), 600))
-    after = mapper.camera_from_model()
+    before = mapper.map.camera_from_model()
+    assert not mapper.replace_features(4 * STEP, blurred(view(truth[4 * STEP], 4), 600))
+    after = mapper.map.camera_from_model()
     assert all(after[stamp].tobytes() == before[stamp].tobytes() for stamp in before)
