@@ -39,7 +39,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.keyframe_cache import Keyframes
-from pipeprog_detect.product.boq import load_bill
+from pipeprog_detect.product.boq import load_boq
 from pipeprog_detect.types import Cloud, Pipe
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
@@ -101,7 +101,7 @@ class Footage:
         bag = Bag.open(recording.bag)
         self.camera: Camera = bag.camera
         self.encoded = {frame.stamp: bytes(deserialize_message(frame.data, CompressedImage).data) for frame in bag}
-        self.bill = load_bill(recording.beside("boq.yaml"))
+        self.boq = load_boq(recording.beside("boq.yaml"))
         self.board_file = load_board_file(recording.beside("board.yaml"))
         self.truth = read_truth(recording.beside("truth.json"))
 
@@ -111,7 +111,7 @@ class Footage:
         poses = taken.map_from_camera.copy()
         poses[:, :3, 3] *= factor
         rows = [number[stamp] for stamp in taken.stamps.tolist()]
-        classes = {planned.name: planned.outer_radius for planned in self.bill.classes}
+        classes = {planned.name: planned.outer_radius for planned in self.boq.classes}
         pipes = tuple(_segment(pipe, factor) for pipe in found)
         result = score(Result(pipes, classes), self.truth, align(poses, self.truth.world_from_camera[rows]))
         return {
@@ -129,7 +129,7 @@ class Footage:
         for stamp, pose in zip(taken.stamps.tolist(), taken.map_from_camera, strict=True):
             store.add(stamp, self.encoded[stamp], self.camera)
             views.append(store.view(stamp, pose))
-        return detect(taken.cloud, self.bill, config, views)
+        return detect(taken.cloud, self.boq, config, views)
 
     def chosen(self) -> list[int]:
         """The stamps of the frames that the selector takes when nobody answers it."""

@@ -30,7 +30,7 @@ from benchmarks.survey import RESULTS
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
 from pipeprog_detect.cloud.axis_voting import Hypothesis
-from pipeprog_detect.cloud.candidate import Candidate, measure
+from pipeprog_detect.cloud.candidate import Candidate, fit_candidate
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
@@ -65,10 +65,12 @@ def cloud(trials: int) -> None:
         free = np.ones(len(tree.points), bool)
         middle = truth.middle
         half = max(2.0 * radius, 0.05)
-        direct = measure(
+        direct = fit_candidate(
             tree, free, Hypothesis(Cylinder(middle - half * truth.axis, middle + half * truth.axis, radius), 0), sigma
         )
-        ends = [measure(tree, free, Hypothesis(turned(middle, truth, half, rng), 0), sigma) for _ in range(trials)]
+        ends = [
+            fit_candidate(tree, free, Hypothesis(turned(middle, truth, half, rng), 0), sigma) for _ in range(trials)
+        ]
         rows.append(
             {
                 "radius mm": 1e3 * radius,

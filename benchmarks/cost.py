@@ -25,7 +25,7 @@ from benchmarks.recordings import ROOT
 from benchmarks.survey import RESULTS, commit
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 
 KEPT = ROOT / "out" / "cost"
 SEED = 21
@@ -68,13 +68,15 @@ def _measured(millions: float) -> dict[str, Any]:
     build, _, distance = LAYOUTS["field"]
     site = build(np.random.default_rng(SEED), 1.0, 0.0, distance)
     radii = site.planned_radii
-    bill = Bill(tuple(PipeClass(f"{1e3 * radius:g}", radius, 10.0, (1.0, 0.0, 0.0), 0.01 * radius) for radius in radii))
+    boq = BillOfQuantities(
+        tuple(PipeClass(f"{1e3 * radius:g}", radius, 10.0, (1.0, 0.0, 0.0), 0.01 * radius) for radius in radii)
+    )
     small, _ = taken(site, 20 * STATIONS * 1000, NOISE, SEED)
-    detect(small, bill, DetectConfig())  # compiles
+    detect(small, boq, DetectConfig())  # compiles
     cloud, _ = taken(site, round(millions * MILLION), NOISE, SEED)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     told: list[tuple[float, str]] = []
-    detect(cloud, bill, DetectConfig(), progress=lambda _, stage: told.append((time.process_time(), stage)))
+    detect(cloud, boq, DetectConfig(), progress=lambda _, stage: told.append((time.process_time(), stage)))
     stages: dict[str, float] = {}
     for (started, stage), (ended, _) in itertools.pairwise(told):
         name = "looking for pipes in patches" if "patches" in stage else stage

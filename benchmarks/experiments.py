@@ -120,8 +120,8 @@ class Case:
             return known
         run, out = RUNS / ours.name, RUNS / self.name
         settings = [argument for text in METHODS[self.method] for argument in ("--set", text)]
-        bill = self.recording.beside("boq.yaml")
-        options = ["--boq", str(bill), "--out", str(out), "--force", *settings]
+        boq = self.recording.beside("boq.yaml")
+        options = ["--boq", str(boq), "--out", str(out), "--force", *settings]
         with (RUNS / f"{self.name}.log").open("w") as log:
             subprocess.run([COMMAND, "detect", run / "cloud.ply", *options], check=True, stdout=log, stderr=log)
         for name in ("trajectory.tum", "frames.csv"):

@@ -24,7 +24,7 @@ import numpy as np
 from pipeprog_bringup.results.scoring import Segment, match, relation
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cloud, Cylinder
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bags"))
@@ -88,14 +88,14 @@ def taken(site: Site, points: int, noise: float, seed: int) -> tuple[Cloud, list
 
 def measured(site: Site, cloud: Cloud, seen: list[bool], config: DetectConfig) -> dict[str, Any]:
     """Figures of one run."""
-    bill = Bill(
+    boq = BillOfQuantities(
         tuple(
             PipeClass(f"{1e3 * radius:g}", radius, 10.0, (1.0, 0.0, 0.0), 0.01 * radius)
             for radius in site.planned_radii
         )
     )
     started = time.process_time()
-    pipes = detect(cloud, bill, config)
+    pipes = detect(cloud, boq, config)
     seconds = time.process_time() - started
     found = [segment(pipe.cylinder, pipe.id, pipe.class_name) for pipe in pipes]
     sigmas = [pipe.radius_sigma for pipe in pipes]

@@ -256,7 +256,7 @@ def votes(survey: Survey, figure: Figure) -> None:
     shape = local_shape.surfaces(
         tree.thinned(tree.level_of(scale / 7)), tree.thinned(tree.level_of(scale)), scale, sigma
     )
-    vote = axis_voting.votes_of(shape, sigma, (0.005, 0.16))
+    vote = axis_voting.patch_votes(shape, sigma, (0.005, 0.16))
     left, right = figure.subplots(1, 2)
     middle = pipe.middle
     u, v = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])

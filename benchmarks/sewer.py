@@ -23,7 +23,7 @@ from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cylinder
 
 SIZES_MM = (180, 195, 200, 340, 400)
@@ -34,13 +34,15 @@ SECTORS, LEAST_POINTS = 72, 5
 
 def main(folder: Path) -> None:
     """Detect in every cloud below `folder`."""
-    bill = Bill(tuple(PipeClass(f"{size}", 5e-4 * size, 10.0, (1.0, 0.0, 0.0), 5e-6 * size) for size in SIZES_MM))
+    boq = BillOfQuantities(
+        tuple(PipeClass(f"{size}", 5e-4 * size, 10.0, (1.0, 0.0, 0.0), 5e-6 * size) for size in SIZES_MM)
+    )
     rows: list[dict[str, Any]] = []
     print("cloud                                    points  told  radius mm  length m  arc deg")
     for path in sorted(folder.glob("*/*.ply")):
         nominal = int(re.findall(r"\d+", path.parent.name)[0])
         cloud = read_cloud(path).cloud
-        pipes = detect(cloud, bill, DetectConfig(concave=True))
+        pipes = detect(cloud, boq, DetectConfig(concave=True))
         best = max(pipes, key=lambda pipe: pipe.points, default=None)
         row: dict[str, Any] = {
             "cloud": f"{path.parent.name}/{path.stem}",

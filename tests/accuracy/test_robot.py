@@ -20,8 +20,8 @@ RECORDING = site("lab", 31, "--size=480p", "--seconds=8", "--fps=2.5", "--allow-
 @pytest.mark.timeout(1800)
 def test_odometry_gives_metres_and_the_imu_what_is_up(tmp_path: Path) -> None:
     recording = made(RECORDING)
-    bill, truth = recording.beside("boq.yaml"), recording.beside("truth.json")
-    subprocess.run([COMMAND, "replay", str(recording.bag), "--boq", str(bill), "--out", str(tmp_path)], check=True)
+    boq, truth = recording.beside("boq.yaml"), recording.beside("truth.json")
+    subprocess.run([COMMAND, "replay", str(recording.bag), "--boq", str(boq), "--out", str(tmp_path)], check=True)
     scale = json.loads((tmp_path / "pipes.json").read_text())["scale"]
     figures = score_files(tmp_path / "pipes.json", truth)
     print(f"scale {figures['scale']['error_percent']:+.3f} %, sigma {100 * scale['sigma']:.3f} %")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pipeprog_camera.camera import Camera
     from pipeprog_camera.errors import InputError
     from pipeprog_detect.config import DetectConfig
-    from pipeprog_detect.product.boq import Bill, PipeClass, load_bill
+    from pipeprog_detect.product.boq import BillOfQuantities, PipeClass, load_boq
     from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
     from pipeprog_frames.config import FramesConfig
     from pipeprog_frames.selector import FrameSelector
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pipeprog_sfm.reconstruction import Reconstruction
 
 __all__ = [
-    "Bill",
+    "BillOfQuantities",
     "Camera",
     "Cloud",
     "CloudFile",
@@ -47,8 +47,8 @@ __all__ = [
     "SfmConfig",
     "View",
     "detect",
-    "load_bill",
     "load_board_file",
+    "load_boq",
     "read_cloud",
     "read_results",
 ]
@@ -60,7 +60,7 @@ _MODULES = {
     "pipeprog_camera.camera": ("Camera",),
     "pipeprog_camera.errors": ("InputError",),
     "pipeprog_detect.config": ("DetectConfig",),
-    "pipeprog_detect.product.boq": ("Bill", "PipeClass", "load_bill"),
+    "pipeprog_detect.product.boq": ("BillOfQuantities", "PipeClass", "load_boq"),
     "pipeprog_detect.types": ("Cloud", "Cylinder", "Pipe", "View"),
     "pipeprog_frames.config": ("FramesConfig",),
     "pipeprog_frames.selector": ("FrameSelector",),

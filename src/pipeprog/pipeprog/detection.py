@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 
 from pipeprog_detect import detector
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.types import Cloud, Pipe, View
 
 
 def detect(
     points: ArrayLike,
-    radii: Sequence[float] | Mapping[str, float] | Bill,
+    radii: Sequence[float] | Mapping[str, float] | BillOfQuantities,
     views: Sequence[View] = (),
     *,
     normals: ArrayLike | None = None,
@@ -27,7 +27,7 @@ def detect(
     Args:
         points: (N, 3) coordinates [m] in any frame; the pipes come back in the same one.
         radii: planned outer radii [m]: a sequence (the classes are then named by it, such as "57.5 mm"), a mapping
-            from class names, or a bill of quantities as `load_bill` reads it.
+            from class names, or a bill of quantities as `load_boq` reads it.
         views: keyframes of the same frame; where they are given, pipes are measured in them.
         normals: (N, 3) unit normals towards the sensor, if known.
         config: settings of the detector; the defaults of docs/parameters.md without.
@@ -41,8 +41,8 @@ def detect(
         InputError: no point is finite, the shapes do not fit, or a radius is no length.
     """
     cloud = Cloud(np.asarray(points, np.float64), None if normals is None else np.asarray(normals, np.float64))
-    bill = radii if isinstance(radii, Bill) else Bill.of_radii(_named(radii))
-    return detector.detect(cloud, bill, config or DetectConfig(), views, progress)
+    boq = radii if isinstance(radii, BillOfQuantities) else BillOfQuantities.of_radii(_named(radii))
+    return detector.detect(cloud, boq, config or DetectConfig(), views, progress)
 
 
 def _named(radii: Sequence[float] | Mapping[str, float]) -> dict[str, float]:

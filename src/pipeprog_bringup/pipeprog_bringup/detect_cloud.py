@@ -13,7 +13,7 @@ from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_bringup.results.overrides import effective
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, load_bill
+from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.product import Product, product_of
 
 # The file's own metres are the scale: none was measured, so nothing is added to the pipes' sigmas.
@@ -38,17 +38,17 @@ def detect_file(
     report: Callable[[float, str], None],
 ) -> Detection:
     """Detect the pipes of a cloud and write pipes.json, progress.csv, config.yaml and run.json into `out`."""
-    bill = load_bill(boq_path)
+    boq = load_boq(boq_path)
     config: DetectConfig = effective(overrides, ("detect",))["detect"]
     started = time.time()
     with OutputFolder(out, force) as folder:
         report(0.0, "reading the cloud")
         file = read_cloud(cloud_path)
         read = time.time()
-        pipes = detect(file.cloud, bill, config, (), report)
+        pipes = detect(file.cloud, boq, config, (), report)
         timings = {"read": read - started, "detect": time.time() - read}
-        detection = Detection(product_of(pipes, bill), len(file.cloud.points), file.dropped)
-        _write(folder, detection, cloud_path, bill, config, timings)
+        detection = Detection(product_of(pipes, boq), len(file.cloud.points), file.dropped)
+        _write(folder, detection, cloud_path, boq, config, timings)
     return detection
 
 
@@ -56,14 +56,14 @@ def _write(
     folder: OutputFolder,
     detection: Detection,
     cloud_path: Path,
-    bill: Bill,
+    boq: BillOfQuantities,
     config: DetectConfig,
     timings: dict[str, float],
 ) -> None:
     result_files.write_pipes(folder.file("pipes.json"), detection.product, SCALE)
     result_files.write_progress(folder.file("progress.csv"), detection.product)
     result_files.write_config(
-        folder.file("config.yaml"), {"detect": dataclasses.asdict(config), "boq": result_files.bill_entries(bill)}
+        folder.file("config.yaml"), {"detect": dataclasses.asdict(config), "boq": result_files.boq_entries(boq)}
     )
     facts = {
         "command": "detect",

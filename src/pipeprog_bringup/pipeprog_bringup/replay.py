@@ -22,7 +22,7 @@ from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.product.boq import load_bill
+from pipeprog_detect.product.boq import load_boq
 from pipeprog_detect.product.product import Product
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
@@ -64,7 +64,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     bag = Bag.open(
         request.bag, request.image_topic, request.camera_info_topic, request.odometry_topic, request.imu_topic
     )
-    bill = load_bill(request.boq)
+    boq = load_boq(request.boq)
     board_file = load_board_file(request.board) if request.board else BoardFile()
     if request.rate is not None and not request.rate > 0:
         raise InputError(f"--rate {request.rate:g}: give a factor above zero, 1 for real time")
@@ -90,7 +90,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             folder.file("config.yaml"),
             {
                 **{node: dataclasses.asdict(config) for node, config in configs.items()},
-                "boq": result_files.bill_entries(bill),
+                "boq": result_files.boq_entries(boq),
                 "boards": [board.name for board in board_file.boards],
                 "replay": {
                     "bag": str(request.bag),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeprog_detect.cloud import axis_voting, local_shape
 from pipeprog_detect.cloud.axis_voting import Hypothesis
-from pipeprog_detect.cloud.candidate import Candidate, measure, own_points, settle, thin_start
+from pipeprog_detect.cloud.candidate import Candidate, fit_candidate, own_points, refit, thin_pipe_start
 from pipeprog_detect.cloud.collinear import elbows, join, near, spanning
 from pipeprog_detect.cloud.cutting_planes import CuttingPlane, place_planes, section_hypotheses
 from pipeprog_detect.cloud.octree import THREADS, Octree
@@ -72,7 +72,7 @@ class Search:
         accepted: list[Candidate] = []
 
         def consider(hypothesis: Hypothesis) -> None:
-            candidate = measure(self.tree, free, hypothesis, self.sigma)
+            candidate = fit_candidate(self.tree, free, hypothesis, self.sigma)
             if candidate is None or self.around.contradict(candidate):
                 return
             if is_pipe(candidate, self.sigma, self.config) or (
@@ -117,14 +117,14 @@ class Search:
             rest = self.tree.subset(free & fresh)
             fine = rest.thinned(rest.level_of(scale / _POINTS_PER_SCALE))
             shape = local_shape.surfaces(fine, rest.thinned(rest.level_of(scale)), scale, self.sigma)
-            yield from axis_voting.consensus(axis_voting.votes_of(shape, self.sigma, self.radius_range))
+            yield from axis_voting.hypotheses_of(axis_voting.patch_votes(shape, self.sigma, self.radius_range))
         self.report(0.7, "looking for thin pipes")
         thin = [planned for planned in self.planned_radii if planned < THICKEST_LINE] or [0.5 * THICKEST_LINE]
         rest = self.tree.subset(free & fresh)
         fine = rest.thinned(rest.level_of(_LINE_SCALE / _POINTS_PER_SCALE))
         shape = local_shape.surfaces(fine, rest.thinned(rest.level_of(0.5 * _LINE_SCALE)), _LINE_SCALE, self.sigma)
-        for line in axis_voting.consensus(axis_voting.line_votes(shape, self.sigma, THICKEST_LINE)):
-            initial = thin_start(self.tree, free, line.cylinder, 1.2 * self.sigma, thin)
+        for line in axis_voting.hypotheses_of(axis_voting.line_votes(shape, self.sigma, THICKEST_LINE)):
+            initial = thin_pipe_start(self.tree, free, line.cylinder, 1.2 * self.sigma, thin)
             if initial is not None:
                 yield Hypothesis(initial, line.votes)
 
@@ -146,7 +146,7 @@ class Search:
                 return accepted[best]
             rows = self.tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
             points = own_points(self.tree.points[rows], cylinder, others)
-            candidate = settle(points, cylinder, band, whole=again or len(pieces) > 1)
+            candidate = refit(points, cylinder, band, whole=again or len(pieces) > 1)
             if candidate is not None and is_pipe(candidate, self.sigma, self.config, _PROPOSED):
                 return candidate
             # Where there are images, they will measure it.

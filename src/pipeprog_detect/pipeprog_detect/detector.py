@@ -15,7 +15,7 @@ from pipeprog_detect.cloud.cutting_planes import parse_planes
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.interior_search import find_concave
 from pipeprog_detect.product import classification
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.apparent_contour import viewing_direction
 from pipeprog_detect.silhouette.edge_support import own_outlines
 from pipeprog_detect.silhouette.occlusion import with_depths
@@ -35,7 +35,7 @@ _WALL_SPACING = 0.01
 
 def detect(
     cloud: Cloud,
-    bill: Bill,
+    boq: BillOfQuantities,
     config: DetectConfig,
     views: Sequence[View] = (),
     progress: Report | None = None,
@@ -62,7 +62,7 @@ def detect(
     tree = octree.build(points)
     report(0.1, "estimating noise")
     sigma = local_shape.estimate_noise(tree)
-    widest = 1.5 * max(planned.outer_radius for planned in bill.classes)
+    widest = 1.5 * max(planned.outer_radius for planned in boq.classes)
     report(0.15, "finding walls")
     walls, on_plane = plane_segmentation.find_planes(tree, sigma, widest)
     plain = tree.subset(on_plane)
@@ -72,13 +72,13 @@ def detect(
     around = Surroundings(tree, outward, walls, plain, sigma)
     if config.concave:
         report(0.3, "looking for pipes seen from inside")
-        bores = [radius for planned in bill.classes for radius, _ in planned.bores]
+        bores = [radius for planned in boq.classes for radius, _ in planned.bores]
         seen = find_concave(tree, around, sigma, (0.7 * min(bores), 1.5 * max(bores)), config)
-        return _product([Measured(each, each.cylinder, each.radius_sigma) for each in seen], bill, shift, config)
-    planned_radii = [planned.outer_radius for planned in bill.classes]
+        return _product([Measured(each, each.cylinder, each.radius_sigma) for each in seen], boq, shift, config)
+    planned_radii = [planned.outer_radius for planned in boq.classes]
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
     judging = with_depths(local_views, points) if config.contour.enabled else []
-    jury = Jury(judging, bill, config.contour, memory)
+    jury = Jury(judging, boq, config.contour, memory)
     # A cloud with normals towards cameras is stereo's, too.
     noise = _STEREO_ON_PIPES * sigma if jury.sits or outward is not None else sigma
     radius_range = (config.radius_min, widest)
@@ -94,11 +94,11 @@ def detect(
     measured = _genuine(measured, around, judging)
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
-    lost = find_lost(points, THICKEST_LINE, measured, judging, bill, config.contour, edges)
+    lost = find_lost(points, THICKEST_LINE, measured, judging, boq, config.contour, edges)
     measured += _genuine(lost, around, judging)
     measured = _abutted(joined(measured), around, judging)
     report(1.0, "done")
-    return _product(measured, bill, shift, config)
+    return _product(measured, boq, shift, config)
 
 
 def _genuine(measured: Sequence[Measured], around: Surroundings, views: Sequence[View]) -> list[Measured]:
@@ -135,16 +135,18 @@ def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
     return pose
 
 
-def _product(measured: Sequence[Measured], bill: Bill, shift: FloatArray, config: DetectConfig) -> list[Pipe]:
+def _product(
+    measured: Sequence[Measured], boq: BillOfQuantities, shift: FloatArray, config: DetectConfig
+) -> list[Pipe]:
     """The classified pipes in the frame that the cloud came in."""
-    pipes = _numbered([_pipe(each, bill, shift, config.concave) for each in measured])
-    pipes = classification.with_kmeans(pipes, bill)
-    return classification.named_by_kmeans(pipes, bill, config.concave) if config.classifier == "kmeans" else pipes
+    pipes = _numbered([_pipe(each, boq, shift, config.concave) for each in measured])
+    pipes = classification.with_kmeans(pipes, boq)
+    return classification.named_by_kmeans(pipes, boq, config.concave) if config.classifier == "kmeans" else pipes
 
 
-def _pipe(measured: Measured, bill: Bill, shift: FloatArray, concave: bool) -> Pipe:
+def _pipe(measured: Measured, boq: BillOfQuantities, shift: FloatArray, concave: bool) -> Pipe:
     candidate, cylinder, sigma = measured.candidate, measured.cylinder, measured.radius_sigma
-    verdict = classification.classify(cylinder.radius, sigma, bill, concave)
+    verdict = classification.classify(cylinder.radius, sigma, boq, concave)
     return Pipe(
         "",
         cylinder.shifted(shift),

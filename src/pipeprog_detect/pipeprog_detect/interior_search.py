@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import local_shape
-from pipeprog_detect.cloud.candidate import Candidate, settle
+from pipeprog_detect.cloud.candidate import Candidate, refit
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.config import DetectConfig
@@ -101,7 +101,7 @@ def _measured(tree: Octree, start: Cylinder, stretch: float, sigma: float, confi
         half = stretch * cylinder.radius * cylinder.axis
         cylinder = Cylinder(middle - half, middle + half, cylinder.radius)
         points = tree.points[tree.near_segment(cylinder.start, cylinder.end, 1.5 * cylinder.radius)]
-        settled = settle(points, cylinder, wide, whole=True)
+        settled = refit(points, cylinder, wide, whole=True)
         if settled is None:
             return None
         candidate = settled

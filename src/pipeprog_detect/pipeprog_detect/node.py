@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.product.boq import Bill, load_bill
+from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
 from pipeprog_detect.product.pipe_runs import PipeRun
@@ -42,12 +42,12 @@ class DetectNode(Node):
     def __init__(self) -> None:
         super().__init__("detect")
         config = declare(self, DetectConfig, extra=("boq", "intermediate"))
-        boq = str(self.declare_parameter("boq", "").value)
-        if not boq:
+        path = str(self.declare_parameter("boq", "").value)
+        if not path:
             raise InputError("no bill of quantities: set the parameter boq to its file")
-        self._bill: Bill = load_bill(boq)
+        self._boq: BillOfQuantities = load_boq(path)
         self._intermediate = bool(self.declare_parameter("intermediate", True).value)
-        self._worker = WorkerProcess(self, serve, (config, self._bill), self._on_event, self._on_death)
+        self._worker = WorkerProcess(self, serve, (config, self._boq), self._on_event, self._on_death)
         self._images: dict[int, CompressedImage] = {}
         self._cameras: dict[int, Camera] = {}
         self._parts: OrderedDict[int, dict[type, Any]] = OrderedDict()  # of maps, by stamp
@@ -154,12 +154,12 @@ class DetectNode(Node):
                 scale_source=status.scale_source,
                 scale_sigma=status.scale_sigma,
                 pipes=[_pipe_msg(pipe) for pipe in product.pipes],
-                classes=[_progress_msg(row, self._bill) for row in product.classes],
+                classes=[_progress_msg(row, self._boq) for row in product.classes],
                 runs=[_run_msg(run) for run in product.runs],
             )
         )
         markers = [Marker(header=header, action=Marker.DELETEALL)]
-        for number, marker in enumerate(pipe_markers(product.pipes, self._bill)):
+        for number, marker in enumerate(pipe_markers(product.pipes, self._boq)):
             markers += _marker_msgs(number, marker, header)
         self._markers.publish(MarkerArray(markers=markers))
         self._finish_when_published()
@@ -239,8 +239,8 @@ def _point(position: NDArray[np.float64]) -> Point:
     return Point(x=x, y=y, z=z)
 
 
-def _progress_msg(row: ClassProgress, bill: Bill) -> msg.ClassProgress:
-    color = next(planned.color for planned in bill.classes if planned.name == row.name)
+def _progress_msg(row: ClassProgress, boq: BillOfQuantities) -> msg.ClassProgress:
+    color = next(planned.color for planned in boq.classes if planned.name == row.name)
     return msg.ClassProgress(
         class_name=row.name,
         outer_radius=row.outer_radius,

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.cloud.map_change import Novelty
+from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.keyframe_cache import Keyframes
-from pipeprog_detect.product.boq import Bill
-from pipeprog_detect.product.pipe_tracker import Identities
+from pipeprog_detect.product.boq import BillOfQuantities
+from pipeprog_detect.product.pipe_tracker import PipeTracker
 from pipeprog_detect.product.product import Product, product_of
 from pipeprog_detect.types import Cloud
 from pipeprog_detect.verification.measurement_cache import Memory
@@ -52,9 +52,9 @@ class PipesReady:
     product: Product
 
 
-def serve(connection: Connection, config: DetectConfig, bill: Bill) -> None:
+def serve(connection: Connection, config: DetectConfig, boq: BillOfQuantities) -> None:
     """Works off commands from `connection` until it closes; of the maps that wait, only the newest counts."""
-    keyframes, identities, memory = Keyframes(), Identities(), Memory()
+    keyframes, identities, memory = Keyframes(), PipeTracker(), Memory()
     while True:
         newest: Map | None = None
         while newest is None or connection.poll():
@@ -71,6 +71,6 @@ def serve(connection: Connection, config: DetectConfig, bill: Bill) -> None:
         ]
         memory.next_map()
         if newest.final:
-            memory.novelty = Novelty()
-        pipes = identities.named(detect(cloud, bill, config, views, memory=memory))
-        connection.send(PipesReady(newest.revision, product_of(pipes, bill)))
+            memory.novelty = MapChange()
+        pipes = identities.named(detect(cloud, boq, config, views, memory=memory))
+        connection.send(PipesReady(newest.revision, product_of(pipes, boq)))

@@ -11,7 +11,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cloud, Cylinder, Pipe
 
 CONFIG = DetectConfig()
@@ -19,11 +19,11 @@ NOISE = 2e-3
 DENSITY = 40_000  # points a square metre
 
 
-def bill(*radii: float) -> Bill:
-    return Bill(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in radii))
+def boq(*radii: float) -> BillOfQuantities:
+    return BillOfQuantities(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in radii))
 
 
-BILL = bill(0.0086, 0.0365, 0.0575)
+BOQ = boq(0.0086, 0.0365, 0.0575)
 
 
 def barrel(rng: np.random.Generator, pipe: Cylinder, arc_deg: float = 150.0) -> FloatArray:
@@ -76,7 +76,7 @@ def scene() -> FloatArray:
 
 @cache
 def detected() -> tuple[Pipe, ...]:
-    return tuple(detect(Cloud(scene()), BILL, CONFIG))
+    return tuple(detect(Cloud(scene()), BOQ, CONFIG))
 
 
 def match(truth: Cylinder, pipes: tuple[Pipe, ...]) -> Pipe:
@@ -109,7 +109,7 @@ def test_walls_and_edges_are_no_pipes() -> None:
 
 def test_the_order_of_the_points_does_not_matter() -> None:
     shuffled = scene()[np.random.default_rng(9).permutation(len(scene()))]
-    for one, other in zip(detected(), detect(Cloud(shuffled), BILL, CONFIG), strict=True):
+    for one, other in zip(detected(), detect(Cloud(shuffled), BOQ, CONFIG), strict=True):
         np.testing.assert_allclose(one.cylinder.start, other.cylinder.start, atol=5e-5)
         np.testing.assert_allclose(one.cylinder.end, other.cylinder.end, atol=5e-5)
         assert one.cylinder.radius == pytest.approx(other.cylinder.radius, abs=5e-5)
@@ -118,13 +118,13 @@ def test_the_order_of_the_points_does_not_matter() -> None:
 def test_far_from_the_origin_and_with_gaps_in_the_data() -> None:
     shift = np.array([448_000.0, 5_411_000.0, 120.0])
     points = np.concatenate([scene() + shift, np.full((20, 3), np.nan)])
-    for one, other in zip(detected(), detect(Cloud(points), BILL, CONFIG), strict=True):
+    for one, other in zip(detected(), detect(Cloud(points), BOQ, CONFIG), strict=True):
         np.testing.assert_allclose(one.cylinder.start + shift, other.cylinder.start, atol=3e-3)
         assert one.cylinder.radius == pytest.approx(other.cylinder.radius, abs=3e-4)
 
 
 def test_a_size_that_is_not_planned_is_kept_without_a_class() -> None:
-    pipe = match(PIPES[2], tuple(detect(Cloud(scene()), bill(0.0086, 0.0365, 0.084), CONFIG)))
+    pipe = match(PIPES[2], tuple(detect(Cloud(scene()), boq(0.0086, 0.0365, 0.084), CONFIG)))
     assert pipe.class_name is None
     assert pipe.cylinder.radius == pytest.approx(PIPES[2].radius, abs=0.8e-3)
 
@@ -133,7 +133,7 @@ def test_pieces_behind_a_clamp_are_one_pipe() -> None:
     rng = np.random.default_rng(2)
     parts = [barrel(rng, pipe_at(0.0, 0.0, 0.0365, 0.0, 0.4)), barrel(rng, pipe_at(0.0, 0.0, 0.0365, 0.48, 1.0))]
     points = np.concatenate(parts)
-    pipes = detect(Cloud(points + rng.normal(0.0, NOISE, points.shape)), BILL, CONFIG)
+    pipes = detect(Cloud(points + rng.normal(0.0, NOISE, points.shape)), BOQ, CONFIG)
     assert len(pipes) == 1
     assert pipes[0].cylinder.length == pytest.approx(1.0, rel=0.02)
 
@@ -141,18 +141,18 @@ def test_pieces_behind_a_clamp_are_one_pipe() -> None:
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((10, 3), np.nan), np.zeros((10, 2))])
 def test_a_cloud_without_points_is_an_error(points: FloatArray) -> None:
     with pytest.raises(InputError, match="cloud"):
-        detect(Cloud(points), BILL, CONFIG)
+        detect(Cloud(points), BOQ, CONFIG)
 
 
 def test_an_empty_room_has_no_pipes() -> None:
     rng = np.random.default_rng(3)
     wall = rectangle(rng, np.zeros(3), np.array([2.0, 0, 0]), np.array([0, 0, 1.0]))
-    assert detect(Cloud(wall + rng.normal(0.0, NOISE, wall.shape)), BILL, CONFIG) == []
+    assert detect(Cloud(wall + rng.normal(0.0, NOISE, wall.shape)), BOQ, CONFIG) == []
 
 
 def test_progress_is_told_and_ends_at_one() -> None:
     told: list[float] = []
-    detect(Cloud(scene()[::4]), BILL, CONFIG, progress=lambda share, _: told.append(share))
+    detect(Cloud(scene()[::4]), BOQ, CONFIG, progress=lambda share, _: told.append(share))
     assert told == sorted(told)
     assert told[-1] == 1.0
 
@@ -162,4 +162,4 @@ def test_a_cloud_too_thin_to_tell_its_noise_holds_no_pipes(front_end: str) -> No
     """A few keyframes far apart leave such a cloud: a handful of points here and there."""
     rng = np.random.default_rng(3)
     clumps = rng.uniform(0, 10, (40, 1, 3)) + rng.uniform(-0.03, 0.03, (40, 12, 3))
-    assert detect(Cloud(clumps.reshape(-1, 3)), BILL, DetectConfig(front_end=front_end)) == []
+    assert detect(Cloud(clumps.reshape(-1, 3)), BOQ, DetectConfig(front_end=front_end)) == []

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cloud, Cylinder, Pipe
 from sitegen.primitives import Primitive, box, cylinder, elbow, rectangle
 from sitegen.scan import scan
@@ -22,7 +22,9 @@ NOISE = 1e-3
 # [m] Three times 0.2 mm, what a cloud's radius and axis are known to beside the noise that its many points average out.
 CLOUD_TOLERANCE = 0.6e-3
 THIN, MEDIUM, THICK = 0.0086, 0.0365, 0.0575
-BILL = Bill(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (THIN, MEDIUM, THICK, 0.0841)))
+BOQ = BillOfQuantities(
+    tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (THIN, MEDIUM, THICK, 0.0841))
+)
 STEEL = PIPE_MATERIALS[0]
 
 
@@ -55,7 +57,7 @@ class Scene:
 
 
 def found(cloud: Cloud, with_normals: bool = False, front_end: str = "normals") -> list[Pipe]:
-    return detect(cloud if with_normals else Cloud(cloud.points), BILL, DetectConfig(front_end=front_end))
+    return detect(cloud if with_normals else Cloud(cloud.points), BOQ, DetectConfig(front_end=front_end))
 
 
 def off_axis(point: FloatArray, line: Cylinder) -> float:
@@ -232,7 +234,9 @@ def test_a_rounded_corner_is_no_pipe_and_hides_none(radius: float, with_normals:
     assert found(fillet(radius, with_pipe=False), with_normals) == []
 
 
-SEWERS = Bill(tuple(PipeClass(str(d), 5e-4 * d, 4.0, (1.0, 0.0, 0.0), 5e-6 * d) for d in (180, 195, 200, 340, 400)))
+SEWERS = BillOfQuantities(
+    tuple(PipeClass(str(d), 5e-4 * d, 4.0, (1.0, 0.0, 0.0), 5e-6 * d) for d in (180, 195, 200, 340, 400))
+)
 
 
 CONCAVE = DetectConfig(concave=True)
@@ -290,7 +294,7 @@ def test_from_outside_a_hollow_is_no_pipe_and_from_inside_a_pipe_is_none() -> No
     scene = Scene()
     upright(scene, 0.5, 0.0841, 0.3)
     cloud = scene.cloud()
-    planned = Bill((PipeClass("168", 0.0841, 4.0, (1.0, 0.0, 0.0), 5e-4),))
+    planned = BillOfQuantities((PipeClass("168", 0.0841, 4.0, (1.0, 0.0, 0.0), 5e-4),))
     assert len(detect(cloud, planned, DetectConfig())) == 1
     assert detect(cloud, planned, CONCAVE) == []
 

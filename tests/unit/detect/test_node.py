@@ -25,7 +25,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.config import ContourConfig, DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.node import DetectNode
-from pipeprog_detect.product.boq import load_bill
+from pipeprog_detect.product.boq import load_boq
 from pipeprog_detect.product.product import Product, product_of
 from pipeprog_detect.types import Cloud
 from pipeprog_msgs import msg
@@ -155,8 +155,8 @@ def test_what_a_robot_is_told_is_what_the_files_hold(stage: Callable[..., Stage]
     assert (message.header.frame_id, messages.stamp_ns(message.header.stamp)) == ("map", START)
     assert (message.map_revision, message.scale_source, message.scale_sigma) == (7, "board", 0.0004)
 
-    bill = load_bill(scene.boq)
-    found = product_of(detect(Cloud(points.astype(float)), bill, DetectConfig(contour=ContourConfig(False))), bill)
+    boq = load_boq(scene.boq)
+    found = product_of(detect(Cloud(points.astype(float)), boq, DetectConfig(contour=ContourConfig(False))), boq)
     assert len(found.pipes) == 3
 
     def file(product: Product) -> str:

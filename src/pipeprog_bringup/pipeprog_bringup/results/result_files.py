@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.pipe_runs import PipeRun
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Pipe
@@ -133,7 +133,7 @@ def write_run(folder: OutputFolder, facts: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def bill_entries(bill: Bill) -> list[dict[str, Any]]:
+def boq_entries(boq: BillOfQuantities) -> list[dict[str, Any]]:
     """The bill of quantities as config.yaml holds it."""
     return [
         {
@@ -142,7 +142,7 @@ def bill_entries(bill: Bill) -> list[dict[str, Any]]:
             "planned_length_m": planned.planned_length,
             "color": "#" + "".join(f"{round(255 * part):02x}" for part in planned.color),
         }
-        for planned in bill.classes
+        for planned in boq.classes
     ]
 
 

@@ -22,8 +22,8 @@ _WAVINESS = 3e-3
 
 
 @dataclass(frozen=True)
-class Run:
-    """A stretch low..high [m] along an axis that shows the pipe's surface."""
+class Interval:
+    """The stretch low..high [m] of an axis along which the pipe's surface is seen."""
 
     low: float
     high: float
@@ -39,11 +39,11 @@ def bin_length(radius: float, points_per_metre: float) -> float:
     return float(np.clip(12.0 / max(points_per_metre, 1.0), 0.005, max(radius, 0.03)))
 
 
-def surface_runs(points: FloatArray, cylinder: Cylinder) -> list[Run]:
+def surface_intervals(points: FloatArray, cylinder: Cylinder) -> list[Interval]:
     """Stretches of the axis along which points (N, 3), all near the surface, cover the pipe.
 
-    Positions are metres from cylinder.start along its axis. Ends lie where the occupancy falls to half of the run's
-    own level, between bins by linear interpolation.
+    Positions are metres from cylinder.start along its axis. Ends lie where the occupancy falls to half of the
+    interval's own level, between bins by linear interpolation.
     """
     if len(points) < 10:
         return []
@@ -66,14 +66,14 @@ def surface_runs(points: FloatArray, cylinder: Cylinder) -> list[Run]:
     covered = arc.sum(axis=1) >= needed
     level = np.median(count[count > 0])
     seen = covered & (count > _LEAST_SHARE * min(level, _local_level(count)))
-    runs: list[Run] = []
+    intervals: list[Interval] = []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
     for first, last in zip(edges[::2], edges[1::2], strict=True):
-        runs.append(Run(*_ends(count, first, last, low, size)))
-    return runs
+        intervals.append(Interval(*_ends(count, first, last, low, size)))
+    return intervals
 
 
-def straight_stretch(points: FloatArray, cylinder: Cylinder, sigma: float) -> Run | None:
+def straight_interval(points: FloatArray, cylinder: Cylinder, sigma: float) -> Interval | None:
     """The longest stretch of the axis on which the section's centre stays on one line: an elbow's does not.
 
     points (N, 3) lie near the surface, within a few `sigma` [m]. In each slice the offset of the section is solved
@@ -95,26 +95,26 @@ def straight_stretch(points: FloatArray, cylinder: Cylinder, sigma: float) -> Ru
     shift, error = _slice_shifts(cosine, sine, distance, place, slices, sigma)
     known = np.flatnonzero(np.isfinite(error))
     if len(known) < 4:
-        return Run(low, low + length)
+        return Interval(low, low + length)
     allowed = 2.5 * error + _WAVINESS + 0.02 * cylinder.radius
     centre = np.asarray(low + (np.arange(slices) + 0.5) * size, np.float64)
     line = _best_line(centre[known], shift[known], allowed[known], max(slices // 6, 1) * size)
     if not line.any():
         return None
     members = known[line]
-    parts = _parts(members, known)
+    parts = _contiguous_slices(members, known)
     longest = max(parts, key=len)
     slope, origin = _fit_line(centre[longest], shift[longest], np.asarray(1.0 / error[longest]))
     off = np.linalg.norm(shift - origin - centre[:, None] * slope, axis=1)
     deviation: FloatArray = np.where(off > 2.5 * error + 0.5 * _WAVINESS, off, np.nan)
     edges = low + longest[0] * size, low + (longest[-1] + 1) * size
-    return Run(
+    return Interval(
         _onset(edges[0], centre[: longest[0]][::-1], deviation[: longest[0]][::-1], cylinder.radius),
         _onset(edges[1], centre[longest[-1] + 1 :], deviation[longest[-1] + 1 :], cylinder.radius),
     )
 
 
-def _parts(members: IntArray, known: IntArray) -> list[IntArray]:
+def _contiguous_slices(members: IntArray, known: IntArray) -> list[IntArray]:
     """The slices `members` parted where known slices between them disagree; a tee's few are bridged."""
     parts: list[IntArray] = [members[:1]]
     for last, following in pairwise(members):
@@ -165,10 +165,10 @@ def _best_line(place: FloatArray, shift: FloatArray, allowed: FloatArray, apart:
     agree = np.zeros(count, np.bool_)
     for first in range(count):
         for second in range(first + 1, count):
-            run = place[second] - place[first]
-            if run < apart:
+            gap = place[second] - place[first]
+            if gap < apart:
                 continue
-            su, sv = (shift[second, 0] - shift[first, 0]) / run, (shift[second, 1] - shift[first, 1]) / run
+            su, sv = (shift[second, 0] - shift[first, 0]) / gap, (shift[second, 1] - shift[first, 1]) / gap
             worth = 0.0
             for k in range(count):
                 du = shift[k, 0] - shift[first, 0] - (place[k] - place[first]) * su
@@ -207,7 +207,7 @@ def _local_level(count: FloatArray) -> float:
 
 
 def _ends(count: FloatArray, first: int, last: int, low: float, size: float) -> tuple[float, float]:
-    """Ends [m] of the run of bins first..last-1: where the counts cross half of the level beside each end."""
+    """Ends [m] of the interval of bins first..last-1: where the counts cross half of the level beside each end."""
     near = max(3, min(8, (last - first) // 2))
     left = np.median(count[first : first + near])
     right = np.median(count[max(last - near, first) : last])

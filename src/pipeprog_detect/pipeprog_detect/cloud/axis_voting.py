@@ -52,7 +52,7 @@ class Votes:
     scale: float
 
 
-def votes_of(shape: Surfaces, sigma: float, radius_range: tuple[float, float]) -> Votes:
+def patch_votes(shape: Surfaces, sigma: float, radius_range: tuple[float, float]) -> Votes:
     """Votes of the sites whose patch is bent one way only, clearly above the noise, by a radius in the range [m].
 
     The patch must span enough of the circle to show its bend (h / r > 0.5) and not more than can be seen (h / r < 1).
@@ -79,7 +79,7 @@ def line_votes(shape: Surfaces, sigma: float, thickest: float) -> Votes:
     return Votes(shape.centres[good], shape.centres[good], shape.line[good], radii, shape.scale)
 
 
-def consensus(votes: Votes) -> list[Hypothesis]:
+def hypotheses_of(votes: Votes) -> list[Hypothesis]:
     """Hypotheses, best supported first: each a cylinder through collinear votes.
 
     Starts at the vote with the most alike ones around it, grows along the line while refitting it, removes its
@@ -169,9 +169,9 @@ def _contiguous(members: IntArray, along: FloatArray, gap: float) -> tuple[IntAr
     if not len(members):
         return members, along
     order = np.argsort(along, kind="stable")
-    run = np.cumsum(np.diff(along[order], prepend=along[order[0]]) > gap)
-    here = run[int(np.argmin(np.abs(along[order])))]
-    keep = order[run == here]
+    group = np.cumsum(np.diff(along[order], prepend=along[order[0]]) > gap)
+    here = group[int(np.argmin(np.abs(along[order])))]
+    keep = order[group == here]
     return members[keep], along[keep]
 
 
@@ -200,14 +200,14 @@ def _local_support(
     around: float,
 ) -> IntArray:
     count = np.zeros(len(points), np.int64)
-    runs = np.zeros((27, 2), np.int64)
+    ranges = np.zeros((27, 2), np.int64)
     found, last = 0, -1
     for i in range(len(points)):
         if own_cells[i] != last:
             last = own_cells[i]
-            found = octree.neighbour_runs(last, cell_keys, cell_starts, level, runs)
+            found = octree.neighbour_ranges(last, cell_keys, cell_starts, level, ranges)
         for r in range(found):
-            for j in range(runs[r, 0], runs[r, 1]):
+            for j in range(ranges[r, 0], ranges[r, 1]):
                 agree, along = _agree(points[j] - points[i], directions[i], directions[j], radii[i], radii[j])
                 if agree and abs(along) < around:
                     count[i] += 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.axial_extent import Run, straight_stretch, surface_runs
+from pipeprog_detect.cloud.axial_extent import Interval, straight_interval, surface_intervals
 from pipeprog_detect.cloud.axis_voting import Hypothesis, Sector
 from pipeprog_detect.cloud.cylinder_fit import CylinderFit, basis, covered_arc, fit_cylinder
 from pipeprog_detect.cloud.octree import Octree
@@ -26,7 +26,7 @@ _BENT_CLOUD = 2e-4
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CloudEvidence:
     """What speaks for and against a cylinder.
 
     arc [rad]: widest stretch of the circumference seen; coverage: share of the length that shows surface; inside:
@@ -45,13 +45,12 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A measured cylinder, standard deviation of its radius [m], points on its surface, stretches seen, evidence."""
+    """A measured cylinder, standard deviation of its radius [m], number of points on its surface, evidence."""
 
     cylinder: Cylinder
     radius_sigma: float
     points: int
-    runs: list[Run]
-    evidence: Evidence
+    evidence: CloudEvidence
 
     @property
     def blurred(self) -> bool:
@@ -64,7 +63,7 @@ class Candidate:
         return 1.2 * self.evidence.noise + 2e-4
 
 
-def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma: float) -> Candidate | None:
+def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma: float) -> Candidate | None:
     """Fit a hypothesis to the points of the tree that are free (N,), and follow it along its axis to its ends.
 
     Only the sector that voted for it is fitted: beside it a neighbour may begin, which is not known yet.
@@ -85,13 +84,13 @@ def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma
             return None
         grown = np.inf
         if turn:
-            runs = _seen_runs(points, cylinder, wide)
-            if not runs:
+            intervals = _visible_intervals(points, cylinder, wide)
+            if not intervals:
                 return None
-            low, high = runs[0].low, runs[-1].high
+            low, high = intervals[0].low, intervals[-1].high
             grown = max(-low, high - cylinder.length)
             cylinder = cylinder.cut(low, high)
-            points = _within(points, cylinder, Run(0.0, cylinder.length))
+            points = _between(points, cylinder, Interval(0.0, cylinder.length))
         facing = _spread_out(_facing(points, cylinder, hypothesis.sector), _FIT_POINTS)
         fit = fit_cylinder(facing, cylinder, wide, reach=reach, along_ray=False)
         if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
@@ -102,10 +101,10 @@ def measure(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma
             break
     margin = cylinder.radius * cylinder.axis
     rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, 1.5 * cylinder.radius + 6.0 * wide)
-    return settle(tree.points[rows[free[rows]]], cylinder, wide, sector=hypothesis.sector)
+    return refit(tree.points[rows[free[rows]]], cylinder, wide, sector=hypothesis.sector)
 
 
-def settle(
+def refit(
     points: FloatArray, cylinder: Cylinder, wide: float, whole: bool = False, sector: Sector | None = None
 ) -> Candidate | None:
     """Measure a cylinder that is nearly right on the points (N, 3) around it, all of which are its own or nobody's.
@@ -116,7 +115,7 @@ def settle(
     """
     near = points[np.abs(_signed_distance(points, cylinder)) < max(5.0 * wide, 0.2 * cylinder.radius)]
     # A cap closes the end: its points lie within the barrel all around, and would draw the radius in.
-    body = _facing(_within(near, cylinder, _without_caps(cylinder, wide)), cylinder, sector)
+    body = _facing(_between(near, cylinder, _without_caps(cylinder, wide)), cylinder, sector)
     fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), cylinder, wide, reach=1.0)
     if fit is None:
         return None
@@ -125,19 +124,19 @@ def settle(
     if fit.rmse > _BLURRED * cylinder.radius:
         fit, radius_sigma = _by_width(body, cylinder, fit, wide)
     cylinder = fit.cylinder.cut_like(cylinder)
-    runs = _shown_runs(near, cylinder, wide) if whole else _seen_runs(near, cylinder, wide)
-    if not runs:
+    intervals = _covered_intervals(near, cylinder, wide) if whole else _visible_intervals(near, cylinder, wide)
+    if not intervals:
         return None
-    cut = cylinder.cut(runs[0].low, runs[-1].high)
-    runs = [Run(run.low - runs[0].low, run.high - runs[0].low) for run in runs]
-    surface = _within(near, cut, Run(0.0, cut.length))
+    cut = cylinder.cut(intervals[0].low, intervals[-1].high)
+    surface = _between(near, cut, Interval(0.0, cut.length))
     surface = surface[np.abs(_signed_distance(surface, cut)) < 3.0 * wide]
-    if len(_within(surface, cut, _without_caps(cut, wide))) < 30:
+    if len(_between(surface, cut, _without_caps(cut, wide))) < 30:
         return None
-    return Candidate(cut, radius_sigma, len(surface), runs, _evidence(points, cut, runs, surface, wide))
+    coverage = sum(interval.length for interval in intervals) / cut.length
+    return Candidate(cut, radius_sigma, len(surface), _evidence(points, cut, surface, wide, coverage))
 
 
-def thin_start(
+def thin_pipe_start(
     tree: Octree, free: NDArray[np.bool_], line: Cylinder, sigma: float, radii: Sequence[float]
 ) -> Cylinder | None:
     """The cylinder, of those of the given radii about a line through the points of a thin pipe, that explains most.
@@ -203,18 +202,20 @@ def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: fl
     return (again or fit), sigma
 
 
-def _evidence(points: FloatArray, cylinder: Cylinder, runs: list[Run], surface: FloatArray, wide: float) -> Evidence:
+def _evidence(
+    points: FloatArray, cylinder: Cylinder, surface: FloatArray, wide: float, coverage: float
+) -> CloudEvidence:
     body = _without_caps(cylinder, wide)
-    surface = _within(surface, cylinder, body)
+    surface = _between(surface, cylinder, body)
     distance = _signed_distance(surface, cylinder)
-    inside = float((_signed_distance(_within(points, cylinder, body), cylinder) < -4.0 * wide).sum()) / len(surface)
+    inside = float((_signed_distance(_between(points, cylinder, body), cylinder) < -4.0 * wide).sum()) / len(surface)
     offset = surface - surface.mean(axis=0)
     lateral = offset - (offset @ cylinder.axis)[:, None] * cylinder.axis
     values = np.linalg.eigvalsh(lateral.T @ lateral / len(lateral))
     square = float(np.mean(distance**2))
-    return Evidence(
+    return CloudEvidence(
         arc=covered_arc(surface, cylinder),
-        coverage=sum(run.length for run in runs) / cylinder.length,
+        coverage=coverage,
         inside=inside,
         noise=float(np.sqrt(square)),
         roundness=_roundness(surface, cylinder, distance),
@@ -248,28 +249,28 @@ def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(square, 0.0)) - cylinder.radius)
 
 
-def _seen_runs(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Run]:
+def _visible_intervals(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Interval]:
     """Stretches of the axis that show surface and lie on one line, without an elbow at an end."""
     distance = np.abs(_signed_distance(points, cylinder))
     skin = distance < 3.0 * wide
     if skin.sum() < 30:
         return []
     # An elbow that leaves a narrow band shows its front only, which does not tell where it went.
-    straight = straight_stretch(points[distance < max(3.0 * wide, 0.2 * cylinder.radius)], cylinder, wide)
+    straight = straight_interval(points[distance < max(3.0 * wide, 0.2 * cylinder.radius)], cylinder, wide)
     if straight is None:
         return []
-    return _connected(
-        surface_runs(_within(points[skin], cylinder, straight), cylinder),
+    return _connected_intervals(
+        surface_intervals(_between(points[skin], cylinder, straight), cylinder),
         _longest_gap(cylinder.radius),
         cylinder.radius,
     )
 
 
-def _shown_runs(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Run]:
+def _covered_intervals(points: FloatArray, cylinder: Cylinder, wide: float) -> list[Interval]:
     """Stretches between the cylinder's ends that show surface."""
     skin = points[np.abs(_signed_distance(points, cylinder)) < 3.0 * wide]
-    runs = surface_runs(_within(skin, cylinder, Run(0.0, cylinder.length)), cylinder)
-    return [run for run in runs if run.length > max(0.5 * cylinder.radius, 0.015)]
+    intervals = surface_intervals(_between(skin, cylinder, Interval(0.0, cylinder.length)), cylinder)
+    return [interval for interval in intervals if interval.length > max(0.5 * cylinder.radius, 0.015)]
 
 
 def _longest_gap(radius: float) -> float:
@@ -277,31 +278,33 @@ def _longest_gap(radius: float) -> float:
     return max(10.0 * radius, 0.3)
 
 
-def _connected(runs: list[Run], gap: float, radius: float) -> list[Run]:
-    """The runs that belong together: from the longest one outwards, a short piece beyond a long gap left out."""
-    runs = [run for run in runs if run.length > max(0.5 * radius, 0.015)]
-    if not runs:
+def _connected_intervals(intervals: list[Interval], gap: float, radius: float) -> list[Interval]:
+    """The intervals of one pipe: the longest one and its neighbours on either side, up to the first gap too long."""
+    intervals = [interval for interval in intervals if interval.length > max(0.5 * radius, 0.015)]
+    if not intervals:
         return []
-    first = last = int(np.argmax([run.length for run in runs]))
-    while first > 0 and _bridged(runs[first - 1], runs[first].low - runs[first - 1].high, gap, radius):
+    first = last = int(np.argmax([interval.length for interval in intervals]))
+    while first > 0 and _bridged(intervals[first - 1], intervals[first].low - intervals[first - 1].high, gap, radius):
         first -= 1
-    while last + 1 < len(runs) and _bridged(runs[last + 1], runs[last + 1].low - runs[last].high, gap, radius):
+    while last + 1 < len(intervals) and _bridged(
+        intervals[last + 1], intervals[last + 1].low - intervals[last].high, gap, radius
+    ):
         last += 1
-    return runs[first : last + 1]
+    return intervals[first : last + 1]
 
 
-def _bridged(run: Run, gap: float, most: float, radius: float) -> bool:
-    return gap < min(most, max(4.0 * run.length, radius))
+def _bridged(interval: Interval, gap: float, most: float, radius: float) -> bool:
+    return gap < min(most, max(4.0 * interval.length, radius))
 
 
-def _without_caps(cylinder: Cylinder, wide: float) -> Run:
+def _without_caps(cylinder: Cylinder, wide: float) -> Interval:
     cap = min(5.0 * wide + 0.015, 0.2 * cylinder.length)
-    return Run(cap, cylinder.length - cap)
+    return Interval(cap, cylinder.length - cap)
 
 
-def _within(points: FloatArray, cylinder: Cylinder, run: Run) -> FloatArray:
+def _between(points: FloatArray, cylinder: Cylinder, interval: Interval) -> FloatArray:
     along = cylinder.along(points)
-    return points[(along >= run.low) & (along <= run.high)]
+    return points[(along >= interval.low) & (along <= interval.high)]
 
 
 def _spread_out(points: FloatArray, most: int) -> FloatArray:

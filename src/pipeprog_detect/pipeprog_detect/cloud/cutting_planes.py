@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.cloud import local_shape
-from pipeprog_detect.cloud.axis_voting import Hypothesis, line_votes, votes_of
+from pipeprog_detect.cloud.axis_voting import Hypothesis, line_votes, patch_votes
 from pipeprog_detect.cloud.cylinder_fit import basis, fit_cylinder
 from pipeprog_detect.cloud.ellipse_search import Ellipse, find_ellipses
 from pipeprog_detect.cloud.octree import Octree
@@ -68,7 +68,7 @@ def place_planes(tree: Octree, sigma: float, radius_range: tuple[float, float]) 
     for scale in _PATCHES:
         sites = tree.thinned(tree.level_of(scale))
         shape = local_shape.surfaces(tree.thinned(tree.level_of(scale / 7.0)), sites, scale, sigma)
-        for votes in (votes_of(shape, sigma, radius_range), line_votes(shape, sigma, 0.5 * scale)):
+        for votes in (patch_votes(shape, sigma, radius_range), line_votes(shape, sigma, 0.5 * scale)):
             places.append(votes.feet)
             directions.append(votes.directions)
     place, direction = np.concatenate(places), np.concatenate(directions)

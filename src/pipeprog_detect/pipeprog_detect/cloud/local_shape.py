@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_detect.cloud.octree import THREADS, Octree, neighbour_runs
+from pipeprog_detect.cloud.octree import THREADS, Octree, neighbour_ranges
 
 # A quadric has six coefficients: twice as many points leave something to judge it by.
 _LEAST_POINTS = 12
@@ -191,16 +191,16 @@ def _fit_sites(
 ) -> tuple[FloatArray, IntArray]:
     table = np.zeros((len(sites), 23))
     count = np.zeros(len(sites), np.int64)
-    runs = np.zeros((27, 2), np.int64)
+    ranges = np.zeros((27, 2), np.int64)
     found, last = 0, -1
     buffer = np.empty((1024, 3))
     for s in range(len(sites)):
         if site_cells[s] != last:
             last = site_cells[s]
-            found = neighbour_runs(last, cell_keys, cell_starts, level, runs)
+            found = neighbour_ranges(last, cell_keys, cell_starts, level, ranges)
         n = 0
         for r in range(found):
-            for i in range(runs[r, 0], runs[r, 1]):
+            for i in range(ranges[r, 0], ranges[r, 1]):
                 dx = points[i, 0] - sites[s, 0]
                 dy = points[i, 1] - sites[s, 1]
                 dz = points[i, 2] - sites[s, 2]

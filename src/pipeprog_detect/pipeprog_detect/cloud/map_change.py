@@ -23,7 +23,7 @@ _NEIGHBOURS = np.array(list(product((-1, 0, 1), repeat=3)))
 _OFFSET, _BITS = 1 << 20, 21
 
 
-class Novelty:
+class MapChange:
     """Remembers how many points a survey's last map had where, and the cylinders that were found in it.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""A linear octree: points sorted along the Morton curve, so that the cells of every level are runs of one array.
+"""A linear octree: points sorted along the Morton curve, so that each cell of every level is one range of the array.
 
 One sort serves voxel thinning, neighbour search and gathering at all scales, and makes every later step independent
 of the order in which the points came.
@@ -24,7 +24,7 @@ _FINEST = 2.0**-15
 
 @dataclass(frozen=True)
 class Cells:
-    """Occupied cells of one level: keys (M,) ascending, and the run starts[i]:starts[i + 1] of points in each."""
+    """Occupied cells of one level: keys (M,) ascending, and the range starts[i]:starts[i + 1] of the points in each."""
 
     level: int
     size: float
@@ -164,8 +164,8 @@ def decode(keys: IntArray) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
-def neighbour_runs(key: int, cell_keys: IntArray, cell_starts: IntArray, level: int, runs: IntArray) -> int:
-    """Runs of points in the 27 cells around cell `key`, written to runs (27, 2); returns how many are occupied."""
+def neighbour_ranges(key: int, cell_keys: IntArray, cell_starts: IntArray, level: int, ranges: IntArray) -> int:
+    """Ranges of the points in the 27 cells around cell `key`, written to ranges (27, 2); returns the number of them."""
     limit = 1 << (_BITS - level)
     x, y, z = _gather(key >> 2), _gather(key >> 1), _gather(key)
     found = 0
@@ -175,8 +175,8 @@ def neighbour_runs(key: int, cell_keys: IntArray, cell_starts: IntArray, level: 
                 wanted = _spread(i) << 2 | _spread(j) << 1 | _spread(k)
                 at = np.searchsorted(cell_keys, wanted)
                 if at < len(cell_keys) and cell_keys[at] == wanted:
-                    runs[found, 0] = cell_starts[at]
-                    runs[found, 1] = cell_starts[at + 1]
+                    ranges[found, 0] = cell_starts[at]
+                    ranges[found, 1] = cell_starts[at + 1]
                     found += 1
     return found
 

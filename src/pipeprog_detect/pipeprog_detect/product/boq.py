@@ -46,8 +46,9 @@ NAMED_COLORS: dict[str, Color] = {
 _FIGURE_11 = {0.0086: "magenta", 0.0365: "blue", 0.0575: "cyan", 0.0841: "green", 0.1095: "red", 0.1223: "yellow"}
 _OTHERS = ("orange", "purple", "lime", "brown", "teal", "pink", "navy", "olive", "maroon", "silver")
 
-# Sewer pipes of PVC (EN 1401) have walls of a 34th to a 41st of the diameter. A bill of sewers may also give the bores
-# themselves as its sizes, which are then made to half a percent.
+# Sewer pipes of PVC (EN 1401) have walls of a 34th to a 41st of the diameter; half of the range is two standard
+# deviations of the bore's radius. A bill of quantities of sewers may also give the bores themselves as its sizes: these
+# are made to half a percent.
 _WALL_SHARE, _WALL_SPREAD = 0.5 * (2 / 34 + 2 / 41), 0.004
 _BORE_TOLERANCE = 0.005
 
@@ -59,7 +60,7 @@ _KEYS = ("name", *_SIZE_KEYS, "wall_mm", "planned_length_m", "color")
 class PipeClass:
     """A planned class: outer radius and its tolerance (one standard deviation) [m], planned length [m], RGB in 0..1.
 
-    wall [m] is the thickness of its wall where the bill tells, of use to a camera inside.
+    wall [m] is the thickness of its wall, None where it is not given; a camera inside sees the bore.
     """
 
     name: str
@@ -81,13 +82,13 @@ class PipeClass:
 
 
 @dataclass(frozen=True)
-class Bill:
+class BillOfQuantities:
     """The planned classes, in the order of the file."""
 
     classes: tuple[PipeClass, ...]
 
     @classmethod
-    def of_radii(cls, radii: Mapping[str, float]) -> Bill:
+    def of_radii(cls, radii: Mapping[str, float]) -> BillOfQuantities:
         """Classes by their outer radii [m] alone: planned lengths are not known (nan).
 
         Raises InputError where there is no class or a radius is no length.
@@ -103,12 +104,12 @@ class Bill:
         return cls(_with_colors(where, classes, [{}] * len(classes)))
 
 
-def load_bill(path: str | Path) -> Bill:
+def load_boq(path: str | Path) -> BillOfQuantities:
     """Read BOQ.yaml (`classes:` with name, planned_length_m, color and a size).
 
     The size is outer_radius_mm, outer_diameter_mm or `size`, a standard one such as `DN50 steel` (see sizes).
 
-    Raises InputError, naming the file, the value and the remedy, for anything that is no bill.
+    Raises InputError, naming the file, the value and the remedy, for anything that is no bill of quantities.
     """
     path = Path(path)
     try:
@@ -140,7 +141,7 @@ def load_bill(path: str | Path) -> Bill:
                     f"{1e3 * new.outer_radius:g} mm and cannot be told apart: merge them"
                 )
         classes.append(new)
-    return Bill(_with_colors(path, classes, entries))
+    return BillOfQuantities(_with_colors(path, classes, entries))
 
 
 def _read_class(path: Path, where: str, entry: object) -> PipeClass:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.types import Pipe
 
 # A pipe farther than this from every nominal radius, in standard deviations of measurement and make, is none of them.
@@ -43,24 +43,24 @@ class Verdict:
     probability: float
 
 
-def classify(radius: float, sigma: float, bill: Bill, concave: bool = False) -> Verdict:
+def classify(radius: float, sigma: float, boq: BillOfQuantities, concave: bool = False) -> Verdict:
     """Class of a pipe of `radius` +- `sigma` [m], whose inner surface it is where `concave`.
 
     Nominal radii stay fixed; the likelihood is Gaussian with the measurement's and the manufacturer's variance, the
     prior is even. A radius more than four standard deviations from every class has none, and one that two classes
     explain is not guessed.
     """
-    posterior = _posterior(radius, sigma, bill, concave)
+    posterior = _posterior(radius, sigma, boq, concave)
     best = int(np.argmax(posterior))
     if not posterior[best] > 0.0:
         return Verdict(None, 0.0)
     probability = float(posterior[best])
-    return Verdict(bill.classes[best].name if probability >= SURE else None, probability)
+    return Verdict(boq.classes[best].name if probability >= SURE else None, probability)
 
 
-def is_planned(radius: float, sigma: float, bill: Bill) -> bool:
-    """Whether a pipe of `radius` +- `sigma` [m] may be of one of the bill's classes, or of one of several."""
-    return classify(radius, sigma, bill).probability > 0.0
+def is_planned(radius: float, sigma: float, boq: BillOfQuantities) -> bool:
+    """Whether a pipe of `radius` +- `sigma` [m] may be of a planned class, be it of one or of one of several."""
+    return classify(radius, sigma, boq).probability > 0.0
 
 
 def by_kmeans(radii: Sequence[float], nominal: Sequence[float]) -> list[int]:
@@ -80,31 +80,31 @@ def by_kmeans(radii: Sequence[float], nominal: Sequence[float]) -> list[int]:
     return [int(label) for label in labels]
 
 
-def with_kmeans(pipes: Sequence[Pipe], bill: Bill) -> list[Pipe]:
+def with_kmeans(pipes: Sequence[Pipe], boq: BillOfQuantities) -> list[Pipe]:
     """The pipes, each with the class that k-means over the radii of all gives it as its `class_kmeans`."""
-    numbers = by_kmeans([pipe.cylinder.radius for pipe in pipes], [planned.outer_radius for planned in bill.classes])
-    return [replace(pipe, class_kmeans=bill.classes[number].name) for pipe, number in zip(pipes, numbers, strict=True)]
+    numbers = by_kmeans([pipe.cylinder.radius for pipe in pipes], [planned.outer_radius for planned in boq.classes])
+    return [replace(pipe, class_kmeans=boq.classes[number].name) for pipe, number in zip(pipes, numbers, strict=True)]
 
 
-def named_by_kmeans(pipes: Sequence[Pipe], bill: Bill, concave: bool = False) -> list[Pipe]:
+def named_by_kmeans(pipes: Sequence[Pipe], boq: BillOfQuantities, concave: bool = False) -> list[Pipe]:
     """The pipes with their `class_kmeans` as their class, each with the posterior probability of that class."""
-    number = {planned.name: k for k, planned in enumerate(bill.classes)}
+    number = {planned.name: k for k, planned in enumerate(boq.classes)}
     return [
         replace(
             pipe,
             class_name=pipe.class_kmeans,
             class_probability=float(
-                _posterior(pipe.cylinder.radius, pipe.radius_sigma, bill, concave)[number[pipe.class_kmeans]]
+                _posterior(pipe.cylinder.radius, pipe.radius_sigma, boq, concave)[number[pipe.class_kmeans]]
             ),
         )
         for pipe in pipes
     ]
 
 
-def _posterior(radius: float, sigma: float, bill: Bill, concave: bool) -> FloatArray:
+def _posterior(radius: float, sigma: float, boq: BillOfQuantities, concave: bool) -> FloatArray:
     """Posterior of each class (K,), all 0 where none is near."""
     number, nominal, tolerance = [], [], []
-    for k, planned in enumerate(bill.classes):
+    for k, planned in enumerate(boq.classes):
         for size, spread in planned.bores if concave else ((planned.outer_radius, planned.tolerance),):
             number.append(k)
             nominal.append(size)
@@ -112,16 +112,16 @@ def _posterior(radius: float, sigma: float, bill: Bill, concave: bool) -> FloatA
     variance = sigma**2 + np.array(tolerance) ** 2
     distance = (radius - np.array(nominal)) ** 2 / variance
     if distance.min() > _REJECT**2:
-        return np.zeros(len(bill.classes))
+        return np.zeros(len(boq.classes))
     likely = -0.5 * distance - 0.5 * np.log(variance)
-    posterior = np.bincount(number, weights=np.exp(likely - likely.max()), minlength=len(bill.classes))
+    posterior = np.bincount(number, weights=np.exp(likely - likely.max()), minlength=len(boq.classes))
     return np.asarray(posterior / posterior.sum())
 
 
-def progress(pipes: Sequence[Pipe], bill: Bill) -> list[ClassProgress]:
-    """Metres installed of each planned class, in the bill's order."""
+def progress(pipes: Sequence[Pipe], boq: BillOfQuantities) -> list[ClassProgress]:
+    """Metres installed of each planned class, in the order of the bill of quantities."""
     table = []
-    for planned in bill.classes:
+    for planned in boq.classes:
         installed = float(sum(pipe.cylinder.length for pipe in pipes if pipe.class_name == planned.name))
         percent = 100.0 * installed / planned.planned_length
         table.append(ClassProgress(planned.name, planned.outer_radius, planned.planned_length, installed, percent))

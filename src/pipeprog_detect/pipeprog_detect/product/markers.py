@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.types import Pipe
 
 UNKNOWN_COLOR = (0.6, 0.6, 0.6)  # grey: no planned class
@@ -29,9 +29,9 @@ class PipeMarker:
     text_position: FloatArray
 
 
-def pipe_markers(pipes: Sequence[Pipe], bill: Bill) -> list[PipeMarker]:
+def pipe_markers(pipes: Sequence[Pipe], boq: BillOfQuantities) -> list[PipeMarker]:
     """One marker a pipe, in the same order."""
-    colors = {planned.name: planned.color for planned in bill.classes}
+    colors = {planned.name: planned.color for planned in boq.classes}
     markers = []
     for pipe in pipes:
         cylinder = pipe.cylinder

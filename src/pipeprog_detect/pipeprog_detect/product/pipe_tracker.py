@@ -15,7 +15,7 @@ from pipeprog_detect.types import Cylinder, Pipe
 _LEAST_OFFSET, _ANGLE, _OVERLAP = 0.02, np.radians(5.0), 0.3
 
 
-class Identities:
+class PipeTracker:
     """Names pipes, map after map; a name is never given to another pipe."""
 
     def __init__(self) -> None:

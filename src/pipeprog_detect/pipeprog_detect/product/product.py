@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import ClassProgress, progress
 from pipeprog_detect.product.pipe_runs import PipeRun, pipe_runs
 from pipeprog_detect.types import Pipe
@@ -20,6 +20,6 @@ class Product:
     runs: list[PipeRun]
 
 
-def product_of(pipes: Sequence[Pipe], bill: Bill) -> Product:
+def product_of(pipes: Sequence[Pipe], boq: BillOfQuantities) -> Product:
     """The product that these pipes make; their ids are final."""
-    return Product(list(pipes), progress(pipes, bill), pipe_runs(pipes))
+    return Product(list(pipes), progress(pipes, boq), pipe_runs(pipes))

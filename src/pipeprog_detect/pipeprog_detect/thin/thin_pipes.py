@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.axial_extent import Run
-from pipeprog_detect.cloud.candidate import Candidate, Evidence
+from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.apparent_contour import viewing_direction
 from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, refine
@@ -42,7 +41,7 @@ def find_lost(
     thickest: float,
     found: Sequence[Measured],
     views: Sequence[View],
-    bill: Bill,
+    boq: BillOfQuantities,
     config: ContourConfig,
     edges: dict[tuple[int, int], FloatArray],
 ) -> list[Measured]:
@@ -51,10 +50,10 @@ def find_lost(
     They must have a planned size and most of their outlines, and these must move against each other from view to
     view as a cylinder's do, where the views differ enough to tell. `edges`: as `ribbons.propose` keeps them.
     """
-    thin = [planned.outer_radius for planned in bill.classes if planned.outer_radius < thickest]
+    thin = [planned.outer_radius for planned in boq.classes if planned.outer_radius < thickest]
     if not views or not thin:
         return []
-    lines = _Lines(views, points.astype(np.float32), thin, bill, config)
+    lines = _Lines(views, points.astype(np.float32), thin, boq, config)
     some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
     lost: list[Measured] = []
@@ -84,7 +83,7 @@ class _Lines:
     views: Sequence[View]
     points: NDArray[np.float32]
     radii: Sequence[float]
-    bill: Bill
+    boq: BillOfQuantities
     config: ContourConfig
 
     def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
@@ -112,7 +111,7 @@ class _Lines:
         fit = refine(start, self.views, known, self.config, self.radii, follow)
         if fit is None or fit.support < LINES_CONVINCING:
             return None
-        if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.bill):
+        if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq):
             return None
         if outline_support(fit.cylinder, self.views, known).weaker_share < 0.5 * LINES_CONVINCING:
             return None
@@ -151,5 +150,5 @@ def _seen(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:
     distance = cylinder.surface_distance(points[(along > 0) & (along < cylinder.length)])
     distance = distance[np.abs(distance) < cylinder.radius]
     noise = float(np.sqrt(np.mean(distance**2))) if len(distance) else cylinder.radius
-    evidence = Evidence(np.pi, fit.support, 0.0, noise, 0.0, 1.0)
-    return Candidate(cylinder, fit.radius_sigma, len(distance), [Run(0.0, cylinder.length)], evidence)
+    evidence = CloudEvidence(np.pi, fit.support, 0.0, noise, 0.0, 1.0)
+    return Candidate(cylinder, fit.radius_sigma, len(distance), evidence)

@@ -10,7 +10,7 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.product.boq import Bill
+from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.apparent_contour import showing
 from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, refine
@@ -42,8 +42,10 @@ ROUND_RADII = 30.0
 class Jury:
     """The keyframes, and what they say about candidates; without views the cloud's word stands."""
 
-    def __init__(self, views: Sequence[View], bill: Bill, config: ContourConfig, memory: Memory | None = None) -> None:
-        self._views, self._bill, self._config = views, bill, config
+    def __init__(
+        self, views: Sequence[View], boq: BillOfQuantities, config: ContourConfig, memory: Memory | None = None
+    ) -> None:
+        self._views, self._boq, self._config = views, boq, config
         self._memory = memory or Memory()
         self._refused: list[Cylinder] = []
 
@@ -64,7 +66,7 @@ class Jury:
         fit = self._as_planned(self._refined(candidate, [], views, follow=False), [])
         vouched = (
             fit is not None
-            and is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill)
+            and is_planned(fit.cylinder.radius, fit.radius_sigma, self._boq)
             and (fit.support > CONVINCING or _agree(candidate, fit))
         )
         if not vouched:
@@ -87,9 +89,9 @@ class Jury:
             fit = self._refined(candidate, others, self._views, trusted=trusted[number])
             if fit is None and not (trusted[number] and (not self.sits or _resolved(candidate))):
                 continue
-            # Where the noise hides the section only the bill tells a thin pipe from the edge of a plate or a corner.
+            # Where the noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
             doubtful = self.sits and (candidate.blurred or not trusted[number])
-            if doubtful and (fit is None or not is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill)):
+            if doubtful and (fit is None or not is_planned(fit.cylinder.radius, fit.radius_sigma, self._boq)):
                 fit = self._of_planned_size(candidate, others)
                 if fit is None:
                     continue
@@ -99,7 +101,7 @@ class Jury:
                 fit = self._as_planned(fit, others)
             if fit is None:
                 measured = Measured(candidate, candidate.cylinder, candidate.radius_sigma)
-            elif not is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill) and _contradict(candidate, fit):
+            elif not is_planned(fit.cylinder.radius, fit.radius_sigma, self._boq) and _contradict(candidate, fit):
                 measured = Measured(candidate, *_by_the_cloud(candidate, fit))
             else:
                 measured = Measured(candidate, fit.cylinder, fit.radius_sigma, fit.rims)
@@ -120,18 +122,16 @@ class Jury:
         A shadow along a pipe passes for its outline where the cameras never rise or fall. Pipes of sizes that nobody
         planned are rarer than shadows, but where the planned size finds no outlines of its own the fit stands.
         """
-        if fit is None or is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill):
+        if fit is None or is_planned(fit.cylinder.radius, fit.radius_sigma, self._boq):
             return fit
         radius = fit.cylinder.radius
-        planned = [
-            one.outer_radius for one in self._bill.classes if abs(one.outer_radius / radius - 1.0) < NEAR_PLANNED
-        ]
+        planned = [one.outer_radius for one in self._boq.classes if abs(one.outer_radius / radius - 1.0) < NEAR_PLANNED]
         for size in planned:
             start = Start(replace(fit.cylinder, radius=size), abs(size - radius), radius_known=True, ends_known=True)
             again = refine(start, self._views, others, self._config)
             if (
                 again is not None
-                and is_planned(again.cylinder.radius, again.radius_sigma, self._bill)
+                and is_planned(again.cylinder.radius, again.radius_sigma, self._boq)
                 and again.support > AS_GOOD * fit.support
             ):
                 return again
@@ -144,7 +144,7 @@ class Jury:
         """
         reach = 3.0 * max(candidate.radius_sigma, candidate.evidence.noise)
         sigma, fits = candidate.evidence.noise, []
-        for one in self._bill.classes:
+        for one in self._boq.classes:
             if candidate.blurred and abs(one.outer_radius - candidate.cylinder.radius) < reach:
                 cylinder = replace(candidate.cylinder, radius=one.outer_radius)
                 start = Start(cylinder, sigma, radius_known=True, ends_known=True)
@@ -152,7 +152,7 @@ class Jury:
                 if (
                     fit is not None
                     and fit.support > CONVINCING
-                    and is_planned(fit.cylinder.radius, fit.radius_sigma, self._bill)
+                    and is_planned(fit.cylinder.radius, fit.radius_sigma, self._boq)
                 ):
                     fits.append(fit)
         return max(fits, key=lambda fit: fit.support, default=None)
@@ -167,7 +167,7 @@ class Jury:
     ) -> ContourFit | None:
         if not views:
             return None
-        planned_radii = [planned.outer_radius for planned in self._bill.classes]
+        planned_radii = [planned.outer_radius for planned in self._boq.classes]
         # The surface may lie as far from its points' mean as they scatter: the cloud's sigma knows of noise alone.
         sigma = max(candidate.radius_sigma, candidate.evidence.noise)
         cylinder = candidate.cylinder

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.collinear import near
-from pipeprog_detect.cloud.map_change import Novelty
+from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.silhouette.apparent_contour import inside
 from pipeprog_detect.silhouette.contour_refinement import ContourFit
 from pipeprog_detect.types import Cylinder, View
@@ -41,7 +41,7 @@ class Memory:
     """
 
     def __init__(self) -> None:
-        self.novelty = Novelty()
+        self.novelty = MapChange()
         self.edges: dict[tuple[int, int], FloatArray] = {}
         self._last: list[_Answer] = []
         self._current: list[_Answer] = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.axial_extent import straight_stretch, surface_runs
+from pipeprog_detect.cloud.axial_extent import straight_interval, surface_intervals
 from pipeprog_detect.types import Cylinder
 
 RADIUS = 0.05
@@ -24,21 +24,22 @@ def half_pipe(low: float, high: float, per_metre: int = 8000, noise: float = 1e-
 
 @pytest.mark.parametrize(("low", "high", "per_metre"), [(0.0, 1.0, 8000), (0.137, 0.842, 8000), (0.1, 0.9, 1000)])
 def test_ends_are_found_within_a_bin(low: float, high: float, per_metre: int) -> None:
-    runs = surface_runs(half_pipe(low, high, per_metre), BARREL)
+    intervals = surface_intervals(half_pipe(low, high, per_metre), BARREL)
     bin_length = max(0.005, 12.0 / per_metre)
-    assert runs[0].low == pytest.approx(low, abs=0.7 * bin_length)
-    assert runs[-1].high == pytest.approx(high, abs=0.7 * bin_length)
+    assert intervals[0].low == pytest.approx(low, abs=0.7 * bin_length)
+    assert intervals[-1].high == pytest.approx(high, abs=0.7 * bin_length)
 
 
 def test_stray_points_make_no_pipe() -> None:
     stray = half_pipe(1.0, 2.0, per_metre=60, seed=5)
-    runs = surface_runs(np.concatenate([half_pipe(0.0, 1.0), stray]), BARREL)
-    assert max(run.high for run in runs if run.length > 0.05) == pytest.approx(1.0, abs=0.01)
+    intervals = surface_intervals(np.concatenate([half_pipe(0.0, 1.0), stray]), BARREL)
+    assert max(interval.high for interval in intervals if interval.length > 0.05) == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_clamp_leaves_two_runs() -> None:
-    runs = surface_runs(np.concatenate([half_pipe(0.0, 0.5), half_pipe(0.56, 1.0)]), BARREL)
-    assert [(round(run.low, 2), round(run.high, 2)) for run in runs if run.length > 0.05] == [(0.0, 0.5), (0.56, 1.0)]
+    intervals = surface_intervals(np.concatenate([half_pipe(0.0, 0.5), half_pipe(0.56, 1.0)]), BARREL)
+    seen = [(round(each.low, 2), round(each.high, 2)) for each in intervals if each.length > 0.05]
+    assert seen == [(0.0, 0.5), (0.56, 1.0)]
 
 
 def test_the_barrel_ends_where_an_elbow_begins() -> None:
@@ -46,7 +47,7 @@ def test_the_barrel_ends_where_an_elbow_begins() -> None:
     beyond = np.clip(points[:, 2] - 0.8, 0.0, None)
     points[:, 1] += beyond**2 / (2.0 * 3.0 * RADIUS)
     off = np.abs(np.hypot(points[:, 0], points[:, 1]) - RADIUS)
-    straight = straight_stretch(points[off < 0.2 * RADIUS], BARREL, 1.2e-3)
+    straight = straight_interval(points[off < 0.2 * RADIUS], BARREL, 1.2e-3)
     assert straight is not None
     assert straight.low == pytest.approx(0.0, abs=0.02)
     assert straight.high == pytest.approx(0.8, abs=0.25 * RADIUS)
@@ -55,6 +56,6 @@ def test_the_barrel_ends_where_an_elbow_begins() -> None:
 def test_a_wavy_pipe_is_straight() -> None:
     points = half_pipe(0.0, 1.0)
     points[:, 1] += 2e-3 * np.sin(12.0 * points[:, 2])
-    straight = straight_stretch(points, BARREL, 1.2e-3)
+    straight = straight_interval(points, BARREL, 1.2e-3)
     assert straight is not None
     assert straight.length > 0.97

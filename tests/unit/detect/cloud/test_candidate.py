@@ -8,7 +8,7 @@ import pytest
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.axis_voting import Hypothesis, Sector
-from pipeprog_detect.cloud.candidate import measure
+from pipeprog_detect.cloud.candidate import fit_candidate
 from pipeprog_detect.types import Cylinder
 
 LENGTH = 0.5
@@ -35,7 +35,7 @@ def test_wall_behind_the_pipe_does_not_draw_the_radius(radius: float, noise: flo
     errors = []
     for seed in range(8):
         points = pipe_before_wall(np.random.default_rng(seed), radius, noise)
-        found = measure(octree.build(points), np.ones(len(points), bool), Hypothesis(start, 1, sector), noise)
+        found = fit_candidate(octree.build(points), np.ones(len(points), bool), Hypothesis(start, 1, sector), noise)
         assert found is not None
         errors.append(found.cylinder.radius - radius)
     # Fitted to the whole circumference the thin ones err by 3 and 4 mm.

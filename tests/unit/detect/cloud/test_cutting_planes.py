@@ -11,10 +11,12 @@ from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.cutting_planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cloud, Cylinder
 
-BILL = Bill(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (0.0086, 0.0365, 0.0575)))
+BOQ = BillOfQuantities(
+    tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (0.0086, 0.0365, 0.0575))
+)
 NOISE = 1e-3
 LEVEL = CuttingPlane(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.0]))
 
@@ -85,7 +87,7 @@ def test_pipes_are_found_measured_and_only_where_the_user_cuts(straighten: bool)
     points = np.concatenate([half_pipe(pipe, seed=k) for k, pipe in enumerate(pipes)])
     for plane, wanted in (("", 3), ("-1,0,0.5 1,0.1,0.5 0,1,0.5", 3), ("0.45,0,0.5 0.45,1,0.5 0.44,0,0.9", 0)):
         config = DetectConfig(front_end="planes", plane=plane, straighten=straighten)
-        found = detect(Cloud(points), BILL, config)
+        found = detect(Cloud(points), BOQ, config)
         assert len(found) == wanted
         for pipe, truth in zip(sorted(found, key=lambda each: each.cylinder.start[0]), pipes, strict=False):
             assert pipe.cylinder.radius == pytest.approx(truth.radius, abs=5e-4)

@@ -7,14 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeprog_detect.cloud import axis_voting
-from pipeprog_detect.cloud.map_change import Novelty
+from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cloud, Cylinder
 from pipeprog_detect.verification.measurement_cache import Memory
 
-BILL = Bill(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (0.0365, 0.0575)))
+BOQ = BillOfQuantities(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (0.0365, 0.0575)))
 NOISE = 2e-3
 DENSITY = 40_000  # points a square metre
 
@@ -41,13 +41,13 @@ def pipe(place: float, radius: float = 0.0365, high: float = 0.9) -> tuple[Cylin
 @settings(max_examples=10, deadline=None)
 @given(st.tuples(*[st.floats(-0.02, 0.02)] * 3), st.integers(0, 99))
 def test_a_map_that_an_adjustment_moved_is_no_news(shift: tuple[float, float, float], seed: int) -> None:
-    novelty = Novelty()
+    novelty = MapChange()
     assert novelty.of(wall(0, 1)).all()
     assert not novelty.of(wall(0, 1, seed) + shift).any()
 
 
 def test_news_are_what_is_new_and_what_is_near_it() -> None:
-    novelty = Novelty()
+    novelty = MapChange()
     novelty.of(wall(0, 1))
     points = np.concatenate([wall(0, 1), wall(1, 1.5, 1)])
     news = novelty.of(points)
@@ -56,13 +56,13 @@ def test_news_are_what_is_new_and_what_is_near_it() -> None:
 
 
 def test_a_place_that_is_seen_better_is_news() -> None:
-    novelty = Novelty()
+    novelty = MapChange()
     novelty.of(wall(0, 1)[::2])
     assert novelty.of(wall(0, 1)).all()
 
 
 def found(cloud: np.ndarray, memory: Memory) -> list[Cylinder]:
-    return [pipe.cylinder for pipe in detect(Cloud(cloud), BILL, DetectConfig(), memory=memory)]
+    return [pipe.cylinder for pipe in detect(Cloud(cloud), BOQ, DetectConfig(), memory=memory)]
 
 
 def near(cylinder: Cylinder, truth: Cylinder) -> bool:
@@ -80,7 +80,7 @@ def test_pipes_of_a_growing_map_are_those_of_the_whole() -> None:
     cylinders = found(grown, memory)
     assert len(cylinders) == 3
     assert all(map(near, cylinders, (first, whole, last)))
-    with patch.object(axis_voting, "votes_of", side_effect=AssertionError("nothing is new")):
+    with patch.object(axis_voting, "patch_votes", side_effect=AssertionError("nothing is new")):
         again = found(grown, memory)
     assert all(near(one, other) for one, other in zip(again, cylinders, strict=True))
     gone = found(np.concatenate([wall(0, 2), whole_points, last_points]), memory)

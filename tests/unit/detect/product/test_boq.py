@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.product.boq import NAMED_COLORS, load_bill
+from pipeprog_detect.product.boq import NAMED_COLORS, load_boq
 
 
 def written(folder: Path, text: str) -> Path:
@@ -29,7 +29,7 @@ classes:
   - {name: odd, outer_radius_mm: 44, planned_length_m: 2.0}
   - {name: odder, outer_radius_mm: 45, planned_length_m: 2.0}
 """
-    classes = load_bill(written(tmp_path, text)).classes
+    classes = load_boq(written(tmp_path, text)).classes
     assert [c.name for c in classes] == ["DN100", "DN65", "17", "odd", "odder"]
     assert [c.outer_radius for c in classes] == pytest.approx([0.0575, 0.0365, 0.02, 0.044, 0.045])
     assert classes[0].color == NAMED_COLORS["cyan"]
@@ -56,7 +56,7 @@ classes:
     ],
 )
 def test_standard_sizes(tmp_path: Path, size: str, diameter_mm: float) -> None:
-    (planned,) = load_bill(written(tmp_path, entry(f"size: '{size}'"))).classes
+    (planned,) = load_boq(written(tmp_path, entry(f"size: '{size}'"))).classes
     assert planned.outer_radius == pytest.approx(0.5e-3 * diameter_mm)
     assert 0 < planned.tolerance < 0.02 * planned.outer_radius
 
@@ -104,16 +104,16 @@ def test_standard_sizes(tmp_path: Path, size: str, diameter_mm: float) -> None:
 def test_a_wrong_bill_is_told_what_to_mend(tmp_path: Path, text: str, told: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
-        load_bill(path)
+        load_boq(path)
     assert told in str(caught.value)
     assert str(path) in str(caught.value)
 
 
 def test_a_wall_is_for_cameras_inside(tmp_path: Path) -> None:
-    (planned,) = load_bill(written(tmp_path, entry("outer_diameter_mm: 200, wall_mm: 5.9"))).classes
+    (planned,) = load_boq(written(tmp_path, entry("outer_diameter_mm: 200, wall_mm: 5.9"))).classes
     assert planned.bores == ((pytest.approx(0.0941), planned.tolerance),)
 
 
 def test_a_missing_bill_names_its_path(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.yaml: cannot read"):
-        load_bill(tmp_path / "none.yaml")
+        load_boq(tmp_path / "none.yaml")

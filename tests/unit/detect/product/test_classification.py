@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.product.classification import (
     SURE,
     Verdict,
@@ -22,11 +22,13 @@ from pipeprog_detect.product.classification import (
 from pipeprog_detect.types import Cylinder, Pipe
 
 
-def bill(*radii: float) -> Bill:
-    return Bill(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), max(0.01 * r, 1e-4)) for r in radii))
+def boq(*radii: float) -> BillOfQuantities:
+    return BillOfQuantities(
+        tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), max(0.01 * r, 1e-4)) for r in radii)
+    )
 
 
-PAPER = bill(0.0086, 0.0365, 0.0575, 0.0841, 0.1095, 0.1223)
+PAPER = boq(0.0086, 0.0365, 0.0575, 0.0841, 0.1095, 0.1223)
 
 
 @pytest.mark.parametrize("radius", [0.0086, 0.0365, 0.0575, 0.0841, 0.1095, 0.1223])
@@ -42,11 +44,11 @@ def test_a_radius_between_the_classes_is_none_of_them(radius: float) -> None:
 
 
 def test_classes_nearer_than_the_sigma_are_ambiguous() -> None:
-    verdict = classify(0.0302, 0.001, bill(0.030, 0.0305))
+    verdict = classify(0.0302, 0.001, boq(0.030, 0.0305))
     assert verdict.name is None
     assert 0.5 < verdict.probability < SURE
     assert classify(
-        0.0300, 0.0001, Bill(tuple(replace(each, tolerance=1e-5) for each in bill(0.030, 0.0305).classes))
+        0.0300, 0.0001, BillOfQuantities(tuple(replace(each, tolerance=1e-5) for each in boq(0.030, 0.0305).classes))
     ).name
 
 
@@ -97,17 +99,17 @@ def test_kmeans_as_the_classifier() -> None:
 
 @pytest.mark.parametrize("diameter_mm", [180, 195, 200, 340, 400])
 def test_sewers_are_classed_by_their_bore(diameter_mm: int) -> None:
-    sewers = bill(*(0.5e-3 * nominal for nominal in (180, 195, 200, 340, 400)))
+    sewers = boq(*(0.5e-3 * nominal for nominal in (180, 195, 200, 340, 400)))
     for wall in (1 / 34, 1 / 41):  # EN 1401: SDR 34 and 41
         bore = 0.5e-3 * diameter_mm * (1 - 2 * wall)
         assert classify(bore, 0.0003, sewers, concave=True).name == f"{0.5 * diameter_mm:g}"
-    bores = bill(*(0.5e-3 * 0.946 * nominal for nominal in (180, 195, 200, 340, 400)))
+    bores = boq(*(0.5e-3 * 0.946 * nominal for nominal in (180, 195, 200, 340, 400)))
     assert classify(0.473e-3 * diameter_mm, 0.0003, bores, concave=True).name == f"{0.473 * diameter_mm:g}"
     assert classify(0.110, 0.0003, sewers, concave=True).name is None
 
 
 def test_a_wall_that_the_bill_gives_is_taken() -> None:
-    thick = Bill(tuple(replace(each, wall=0.01) for each in bill(0.1, 0.11).classes))
+    thick = BillOfQuantities(tuple(replace(each, wall=0.01) for each in boq(0.1, 0.11).classes))
     assert classify(0.1, 0.0002, thick, concave=True).name == "110"
 
 
@@ -116,5 +118,5 @@ def test_progress_sums_the_barrels_of_each_class() -> None:
         barrel = Cylinder(np.zeros(3), np.array([0.0, 0.0, length]), 0.03)
         return Pipe("p", barrel, 1e-4, name, 1.0, 2.0, 1e-3, 100)
 
-    table = progress([pipe(1.0, "30"), pipe(0.5, "30"), pipe(9.0, None)], bill(0.03, 0.05))
+    table = progress([pipe(1.0, "30"), pipe(0.5, "30"), pipe(9.0, None)], boq(0.03, 0.05))
     assert [(row.name, row.installed, row.percent) for row in table] == [("30", 1.5, 37.5), ("50", 0.0, 0.0)]

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeprog_detect.cloud.axial_extent import Run
-from pipeprog_detect.cloud.candidate import Candidate, Evidence
+from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import ContourConfig
-from pipeprog_detect.product.boq import Bill, PipeClass
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.keyframe_verifier import Jury
 from tests.unit.detect.pipe_and_wall import PIPE
 from tests.unit.detect.straight_ahead import looking_along_y
 
-BILL = Bill((PipeClass("DN65", PIPE.radius, 3.0, (0.0, 0.0, 1.0), 4e-4),))
+BOQ = BillOfQuantities((PipeClass("DN65", PIPE.radius, 3.0, (0.0, 0.0, 1.0), 4e-4),))
 
 
 def test_a_pipe_that_few_keyframes_of_many_show_is_vouched_for(pipe_views: list[View]) -> None:
     """On a long walk every thirtieth part of the keyframes would show the pipe twice, and no outline in three."""
     elsewhere = [looking_along_y(20.0 + number, 1000 + number) for number in range(200)]
     views = [view for number, view in enumerate(pipe_views) for view in [view, *elsewhere[25 * number :][:25]]]
-    evidence = Evidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
+    evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
     rough = Cylinder(PIPE.start, PIPE.end, 0.042)
-    candidate = Candidate(rough, 0.002, 900, [Run(0.0, rough.length)], evidence)
-    assert Jury(views, BILL, ContourConfig()).vouches_for(candidate)
-    assert not Jury(elsewhere, BILL, ContourConfig()).vouches_for(candidate)
+    candidate = Candidate(rough, 0.002, 900, evidence)
+    assert Jury(views, BOQ, ContourConfig()).vouches_for(candidate)
+    assert not Jury(elsewhere, BOQ, ContourConfig()).vouches_for(candidate)
