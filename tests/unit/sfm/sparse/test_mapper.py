@@ -16,7 +16,11 @@ from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.matching import match
 from pipeprog_sfm.sparse.retrieval import Retrieval
 
-POSITION_TOLERANCE = 0.003  # m at 2 m from the wall: some ten times the noise of a camera held by 300 points
+# [m] Of a point at 2 m, 0.3 px are 0.7 mm; 300 points that hold a camera leave 0.04 mm, which trading turn for shift
+# and the drift along 3 m of wall multiply by ten: 0.4 mm, and room for the largest error of fifteen cameras.
+POSITION_TOLERANCE = 1e-3
+# [m] Half a per cent of the focal length opens the loop by 28 px, which are 55 mm at 4 m: a tenth of it may stay.
+LOOP_TOLERANCE = 5.5e-3
 
 
 def walk(xs: NDArray[Any], period: float | None = None, seed: int = 0) -> tuple[Mapper, dict[int, NDArray[Any]]]:
@@ -84,7 +88,7 @@ def test_two_models_are_joined_when_the_camera_returns() -> None:
     assert len(mapper.map.models) == 1
     poses = mapper.map.camera_from_model()
     assert len(poses) == len(truth)
-    assert position_errors(poses, truth).max() < 2 * POSITION_TOLERANCE
+    assert position_errors(poses, truth).max() < POSITION_TOLERANCE
 
 
 def test_a_loop_is_closed_though_the_map_has_drifted() -> None:
@@ -99,8 +103,7 @@ def test_a_loop_is_closed_though_the_map_has_drifted() -> None:
     poses = mapper.map.camera_from_model()
     assert list(poses) == sorted(truth)
     assert len(mapper.map.models) == 1
-    # A focal length that is off strains the map, but no gap is left: 28 px are 55 mm at 4 m from the axis.
-    assert position_errors(poses, truth).max() < 3 * POSITION_TOLERANCE
+    assert position_errors(poses, truth).max() < LOOP_TOLERANCE
     relative = poses[0] @ np.linalg.inv(poses[40 * STEP])
     assert np.degrees(np.arccos((np.trace(relative[:3, :3]) - 1) / 2)) < 0.1, "the 41st looks where the first did"
 
@@ -228,7 +231,9 @@ def test_features_that_fit_better_are_taken(kept: int) -> None:
     assert list(poses) == list(truth)
     assert position_errors(poses, truth).max() < POSITION_TOLERANCE
     reports = {report.stamp: report for report in mapper.map.overlap_reports()}
-    assert reports[4 * STEP].matches_next > 0.7 * reports[3 * STEP].matches_previous
+    # As many matches as between two that were sharp from the first, but for the scatter of two counts.
+    usual = reports[3 * STEP].matches_previous
+    assert reports[4 * STEP].matches_next > usual - 3.0 * np.sqrt(2.0 * usual)
 
 
 def test_features_that_fit_worse_change_nothing() -> None:
