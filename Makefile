@@ -20,7 +20,7 @@ PACKAGES := $(wildcard src/*/package.xml src/*/setup.py src/*/setup.cfg src/*/CM
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | while IFS="$$(printf '\t')" read -r name what; do printf '  make %-12s %s\n' "$$name" "$$what"; done
 
-setup: $(VENV)/.workspace ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter)
+setup: $(VENV)/.workspace $(if $(VIEW),$(VENV)/.view) ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter; VIEW=1 adds Open3D for pipeprog view)
 
 $(VENV)/.home:
 	@$(SHELL) setup/check.sh "$(PYTHON)"
@@ -31,6 +31,12 @@ $(VENV)/.home:
 $(VENV)/.packages: $(VENV)/.home requirements.txt requirements-ros.txt requirements-dev.txt
 	@echo "Installing the Python packages (a few hundred MB the first time) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-ros.txt -r requirements-dev.txt
+	@touch $@
+
+$(VENV)/.view: $(VENV)/.packages requirements-view.txt
+	@$(SHELL) setup/check.sh "$(BIN)/python" view
+	@echo "Installing Open3D (another 550 MB) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-view.txt
 	@touch $@
 
 $(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(wildcard setup/tf2_msgs/* setup/tf2_msgs/msg/*) $(INTERFACES) $(PACKAGES)

@@ -45,6 +45,7 @@ FOLDERS = {
         "recording": set(),
         "results": set(),
         "report": {"results"},
+        "view": {"report", "results"},
         "playback": {"recording", "results"},
     },
 }
@@ -68,6 +69,7 @@ DEPENDENCIES = {
     "lz4": None,
     "mcap": None,
     "mcap_ros2": None,
+    "open3d": None,
     "plyfile": None,
     "pye57": None,
     "pycolmap": None,

@@ -14,22 +14,21 @@ from pipeprog_detect.types import Cloud, Pipe, View
 
 
 def detect(
-    points: ArrayLike,
+    points: ArrayLike | Cloud,
     radii: Sequence[float] | Mapping[str, float] | BillOfQuantities,
     views: Sequence[View] = (),
     *,
-    normals: ArrayLike | None = None,
     config: DetectConfig | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> list[Pipe]:
     """Finds, measures and classifies the pipes of a metric cloud.
 
     Args:
-        points: (N, 3) coordinates [m] in any frame; the pipes come back in the same one.
+        points: (N, 3) coordinates [m] in any frame, in which the pipes come back; or a `Cloud`, which may hold
+            normals towards the sensor, too: they tell a pipe's outside from its inside.
         radii: planned outer radii [m]: a sequence (the classes are then named by it, such as "57.5 mm"), a mapping
             from class names, or a bill of quantities as `load_boq` reads it.
         views: keyframes of the same frame; where they are given, pipes are measured in them.
-        normals: (N, 3) unit normals towards the sensor, if known.
         config: settings of the detector; the defaults of docs/parameters.md without.
         progress: called with the share done (0 to 1) and what is being done.
 
@@ -40,7 +39,7 @@ def detect(
     Raises:
         InputError: no point is finite, the shapes do not fit, or a radius is no length.
     """
-    cloud = Cloud(np.asarray(points, np.float64), None if normals is None else np.asarray(normals, np.float64))
+    cloud = points if isinstance(points, Cloud) else Cloud(np.asarray(points, np.float64))
     boq = radii if isinstance(radii, BillOfQuantities) else BillOfQuantities.of_radii(_named(radii))
     return detector.detect(cloud, boq, config or DetectConfig(), views, progress)
 

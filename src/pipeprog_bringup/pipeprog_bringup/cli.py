@@ -202,6 +202,32 @@ def report(
     typer.echo(f"Report: {target}")
 
 
+@app.command(rich_help_panel="From results")
+def view(
+    folder: Annotated[Path, typer.Argument(help="Results of a survey.", metavar="DIR")],
+    image: Annotated[
+        Path | None,
+        typer.Option("--image", help="Write a picture; this needs no display.", metavar="FILE.png"),
+    ] = None,
+    mesh: Annotated[
+        Path | None,
+        typer.Option("--mesh", help="Write the pipes as meshes for CAD and viewers.", metavar="FILE.glb|ply|obj"),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the files that are named.")] = False,
+) -> None:
+    """Show cloud, pipes and cameras in a window; with --image or --mesh write a file and open none."""
+    from pipeprog_bringup.view import display
+
+    if image is not None:
+        display.write_image(folder, image, force)
+        typer.echo(f"Picture: {image}")
+    if mesh is not None:
+        display.write_mesh(folder, mesh, force)
+        typer.echo(f"Meshes of the pipes: {mesh}")
+    if image is None and mesh is None:
+        display.show(folder)
+
+
 def main() -> None:
     """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
     from pipeprog_bringup.playback.node_processes import NodeFailure
