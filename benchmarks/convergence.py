@@ -32,7 +32,6 @@ from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
 from pipeprog_detect.cloud.axis_voting import Hypothesis
 from pipeprog_detect.cloud.candidate import Candidate, fit_candidate
 from pipeprog_detect.cloud.cylinder_fit import basis
-from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.types import Cylinder, View
 
@@ -151,9 +150,7 @@ def contour(recordings: Sequence[Recording], starts: int, most_views: int) -> No
             others = pipes[:number] + pipes[number + 1 :]
             errors, sigmas = [], []
             for _ in track(range(starts), f"{recording.name}, pipe {number}"):
-                fit = refine(
-                    Start(disturbed(pipe, rng), RADIUS_OFF_IMAGE * pipe.radius), views, others, ContourConfig()
-                )
+                fit = refine(Start(disturbed(pipe, rng), RADIUS_OFF_IMAGE * pipe.radius), views, others)
                 if fit is not None:
                     errors.append(1e3 * (fit.cylinder.radius - pipe.radius))
                     sigmas.append(1e3 * fit.radius_sigma)

@@ -40,7 +40,7 @@ from pipeprog_detect.cloud.cylinder_fit import basis, fit_cylinder
 from pipeprog_detect.cloud.ellipse_search import find_ellipses
 from pipeprog_detect.silhouette.apparent_contour import project, tangent_normals
 from pipeprog_detect.silhouette.limb_edges import LINEAR_LIGHT, limb_basis
-from pipeprog_detect.thin.line_segments import ribbons, straight_edges
+from pipeprog_detect.thin.line_segments import segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import load_board_file
@@ -379,7 +379,7 @@ def thin(survey: Survey, figure: Figure) -> None:
     first = survey.best_view(pipe.middle)
     for axes, number in zip(figure.subplots(1, 2), (first - 3, first), strict=True):
         view = survey.view(number)
-        pairs = ribbons(straight_edges(view.image), 4.0, 12.0)
+        pairs = segment_pairs(straight_edges(view.image), 4.0, 12.0)
         _photo(axes, survey.images[number])
         for pair in pairs.ends:
             axes.plot(*pair.T, "-", color=ORANGE, lw=2)
@@ -433,7 +433,7 @@ def runs(survey: Survey, figure: Figure) -> None:
 
 def _contour_lines(pipe: Cylinder, view: View) -> tuple[FloatArray, float]:
     """The apparent contour's lines (2 sides, 2 ends, 2) [px] over the barrel, and their distance in the middle [px]."""
-    normals = tangent_normals(pipe.start, pipe.axis, pipe.radius, view.centre)
+    normals = tangent_normals(pipe, view.centre)
     assert normals is not None
     touching = [np.stack([pipe.start, pipe.end]) - pipe.radius * normal for normal in normals]
     lines = np.stack([project(view, points)[0] for points in touching])

@@ -18,8 +18,8 @@ from pipeprog_detect.cloud.cutting_planes import CuttingPlane, place_planes, sec
 from pipeprog_detect.cloud.octree import THREADS, Octree
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.types import Cylinder
-from pipeprog_detect.verification.keyframe_verifier import Jury
-from pipeprog_detect.verification.scene_context import Surroundings
+from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
+from pipeprog_detect.verification.scene_context import SceneContext
 
 # Neighbourhoods [m] in which the bend of a pipe is seen, for radii from 1 to 2 times as large. Fine to coarse, each on
 # what the ones before have not explained: a coarse patch may span two pipes of a rack, a fine one may not. The finest
@@ -46,17 +46,17 @@ class Search:
         radius_range: least and largest radius [m].
         planned_radii: those of the bill [m].
         config: what makes a pipe.
-        jury: the images.
+        verifier: the images.
         report: is told the share of the detection that is done (0..1), and what is being done.
     """
 
     tree: Octree
-    around: Surroundings
+    around: SceneContext
     sigma: float
     radius_range: tuple[float, float]
     planned_radii: Sequence[float]
     config: DetectConfig
-    jury: Jury
+    verifier: KeyframeVerifier
     report: Report
 
     def candidates(
@@ -73,10 +73,10 @@ class Search:
 
         def consider(hypothesis: Hypothesis) -> None:
             candidate = fit_candidate(self.tree, free, hypothesis, self.sigma)
-            if candidate is None or self.around.contradict(candidate):
+            if candidate is None or self.around.rejects(candidate):
                 return
             if is_pipe(candidate, self.sigma, self.config) or (
-                is_pipe(candidate, self.sigma, self.config, _PROPOSED) and self.jury.vouches_for(candidate)
+                is_pipe(candidate, self.sigma, self.config, _PROPOSED) and self.verifier.verify(candidate)
             ):
                 accepted.append(candidate)
                 cylinder = candidate.cylinder
@@ -99,7 +99,7 @@ class Search:
         return [
             candidate
             for candidate in self._settled(accepted)
-            if self.jury.sits or not candidate.blurred or self._is_planned(candidate)
+            if self.verifier.has_views or not candidate.blurred or self._is_planned(candidate)
         ]
 
     def _is_planned(self, candidate: Candidate) -> bool:
@@ -150,7 +150,7 @@ class Search:
             if candidate is not None and is_pipe(candidate, self.sigma, self.config, _PROPOSED):
                 return candidate
             # Where there are images, they will measure it.
-            return replace(accepted[best], cylinder=cylinder) if self.jury.sits else None
+            return replace(accepted[best], cylinder=cylinder) if self.verifier.has_views else None
 
         for again in (False, True):
             joined = join([candidate.cylinder for candidate in accepted])

@@ -17,7 +17,7 @@ from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.types import Cylinder
-from pipeprog_detect.verification.scene_context import Surroundings
+from pipeprog_detect.verification.scene_context import SceneContext
 
 # Of all pairs of sites a hundredth lie on one pipe even where nine tenths of the sites are stray: 400 good ones remain.
 _PAIRS = 40_000
@@ -50,7 +50,7 @@ _ROUGHEST = 0.05
 
 def find_concave(
     tree: Octree,
-    around: Surroundings,
+    around: SceneContext,
     sigma: float,
     radius_range: tuple[float, float],
     config: DetectConfig,

@@ -63,6 +63,10 @@ class Cylinder:
         """The point (3,) of the axis halfway between the ends [m]."""
         return 0.5 * (self.start + self.end)
 
+    def at(self, shares: NDArray[np.floating]) -> FloatArray:
+        """Points (N, 3) on the axis at shares (N,) of the length from the start, 0 to 1 between the ends."""
+        return np.asarray(self.start + shares[:, None] * (self.end - self.start), np.float64)
+
     def along(self, points: NDArray[np.floating]) -> FloatArray:
         """Positions (N,) of points (N, 3) along the axis, from the start [m]."""
         return np.asarray((points - self.start) @ self.axis)

@@ -17,7 +17,7 @@ from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.pipe_tracker import PipeTracker
 from pipeprog_detect.product.product import Product, product_of
 from pipeprog_detect.types import Cloud
-from pipeprog_detect.verification.measurement_cache import Memory
+from pipeprog_detect.verification.measurement_cache import MeasurementCache
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class PipesReady:
 
 def serve(connection: Connection, config: DetectConfig, boq: BillOfQuantities) -> None:
     """Works off commands from `connection` until it closes; of the maps that wait, only the newest counts."""
-    keyframes, identities, memory = Keyframes(), PipeTracker(), Memory()
+    keyframes, identities, memory = Keyframes(), PipeTracker(), MeasurementCache()
     while True:
         newest: Map | None = None
         while newest is None or connection.poll():

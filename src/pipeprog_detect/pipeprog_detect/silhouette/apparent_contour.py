@@ -1,27 +1,35 @@
-"""The apparent contour of a circular cylinder: where its two outlines lie in a view, and how they move with it."""
+"""The apparent contour of a circular cylinder: its two image lines in a view, and how they move with the cylinder."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_detect.silhouette.occlusion import behind
 from pipeprog_detect.types import Cylinder, View
+
+# Nearer to the camera than this [m] nothing is projected: closer than any camera of the project focuses.
+NEAR_PLANE = 0.05
+# Positions along the axis are equal to a micrometre: samples of all views share them but for rounding.
+POSITION_DIGITS = 6
 
 
 @dataclass(frozen=True)
-class Stations:
-    """N points on the predicted outlines of one cylinder in several views.
+class ContourSamples:
+    """N positions on the predicted apparent contour of one cylinder in several views, where edges are sought.
 
-    `view` index of the view, `side` 0 or 1; `pixel` (N, 2); `normal` (N, 2) unit, outwards from the pipe; `tangent` is
-    the normal turned by 90 degrees. `along` position on the axis from the cylinder's middle [m]; `gain` displacement of
-    the outline in pixels for one metre of the surface; `half_width` apparent radius of the pipe [px];
-    `jacobian` (N, 5) outward displacement [px] for each unit of (offset at the start along both frame vectors, the same
-    at the end, radius) [m].
+    Attributes:
+        view: index (N,) of the view.
+        side: 0 or 1 (N,), which of the two lines.
+        pixel: (N, 2) [px].
+        normal: (N, 2) unit vectors across the line, outwards from the pipe.
+        along: position (N,) on the axis from the cylinder's middle [m].
+        gain: displacement (N,) of the line for one metre of the surface [px/m].
+        half_width: apparent radius (N,) of the pipe [px].
+        jacobian: (N, 5) outward displacement [px] for one metre of each component of the step of `moved`.
     """
 
     view: IntArray
@@ -36,18 +44,32 @@ class Stations:
     def __len__(self) -> int:
         return len(self.view)
 
-    def select(self, keep: NDArray[np.bool_] | IntArray) -> Stations:
-        """Those stations that a mask or an index array names."""
-        return Stations(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+    def select(self, keep: NDArray[np.bool_] | IntArray) -> ContourSamples:
+        """Those that a mask or an index array names."""
+        return ContourSamples(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+    def thinned(self, limit: int) -> ContourSamples:
+        """About `limit` of them (fewer than twice as many), evenly spread."""
+        return self.select(np.arange(0, len(self), max(len(self) // limit, 1)))
+
+    def sideways(self) -> FloatArray:
+        """Sign (N,) of the outward displacement that a shift of the whole pipe towards side 0 causes."""
+        return np.where(self.side == 0, 1.0, -1.0)
+
+    def positions(self) -> tuple[FloatArray, IntArray]:
+        """The distinct positions (B,) along the axis [m], and the index (N,) of each sample's own among them."""
+        along, index = np.unique(np.round(self.along, POSITION_DIGITS), return_inverse=True)
+        return along, index.astype(np.int64)
 
 
-def tangent_normals(point: FloatArray, axis: FloatArray, radius: float, centre: FloatArray) -> FloatArray | None:
+def tangent_normals(cylinder: Cylinder, centre: FloatArray) -> FloatArray | None:
     """Unit normals (2, 3) of the planes through `centre` that touch the cylinder; None where it lies inside.
 
     Both point inwards: the axis lies at distance `radius` on their positive side. The tangent-plane form of the
-    outline of a straight homogeneous generalised cylinder.
+    apparent contour of a straight homogeneous generalised cylinder.
     """
-    offset = point - centre
+    axis, radius = cylinder.axis, cylinder.radius
+    offset = cylinder.start - centre
     offset = offset - axis * (axis @ offset)
     distance = float(np.linalg.norm(offset))
     if distance <= radius * (1.0 + 1e-9):
@@ -97,150 +119,70 @@ def project(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return pixel, depth
 
 
-def inside(view: View, points: FloatArray) -> NDArray[np.bool_]:
-    """Which points (N, 3) of the map lie before the camera and within the image."""
+def in_image(view: View, points: FloatArray) -> NDArray[np.bool_]:
+    """Mask (N,) of the points (N, 3) of the map that lie before the camera and within the image."""
     pixel, depth = project(view, points)
     size = np.array([view.camera.width, view.camera.height])
-    return np.asarray((depth > 0.05) & (pixel > 0).all(axis=1) & (pixel < size - 1).all(axis=1))
+    return np.asarray((depth > NEAR_PLANE) & (pixel > 0).all(axis=1) & (pixel < size - 1).all(axis=1))
 
 
-def showing(points: FloatArray, views: Sequence[View], most: int) -> list[View]:
-    """Views, spread evenly and no more than `most`, of those that show some of the points (N, 3) of the map."""
-    able = [view for view in views if inside(view, points).any()]
+def views_showing(points: FloatArray, views: Sequence[View], most: int) -> list[View]:
+    """The views that show some of the points (N, 3) of the map, evenly thinned to `most` at the most."""
+    able = [view for view in views if in_image(view, points).any()]
     return able[:: -(-len(able) // most)] if able else []
 
 
-def stations(
+def contour_samples(
     cylinder: Cylinder, views: Sequence[View], basis: FloatArray, spacing: float, margin: float = 4.0
-) -> Stations:
-    """Points on the outlines inside the images, about `spacing` pixels apart along the pipe in the median view.
+) -> ContourSamples:
+    """Samples farther than `margin` [px] inside the images, about `spacing` [px] apart in the median view.
 
-    The positions along the axis are common to all views, so that evidence can be pooled by position.
-    The Jacobian is exact: displacing the surface by d along its outward normal at the contact generator moves the
-    outline by d / (depth |l|) pixels, l being the image line of the tangent plane (envelope theorem).
+    The positions along the axis are common to all views, so that evidence can be pooled by position. `basis` (2, 3):
+    the directions of the step (see `moved`) of which the Jacobian is taken.
     """
-    axis, length = cylinder.axis, cylinder.length
-    gains = []
-    for view in views:
-        distance = float(np.linalg.norm(view.centre - cylinder.middle))
-        gains.append(view.camera.fx / max(distance, 1e-3))
+    gains = [view.camera.fx / max(float(np.linalg.norm(view.centre - cylinder.middle)), 1e-3) for view in views]
     step = spacing / float(np.median(gains))
-    count = max(int(length / step), 4)
+    count = max(int(cylinder.length / step), 4)
     fractions = (np.arange(count) + 0.5) / count
-    parts: list[tuple[np.ndarray, ...]] = []
+    parts: list[tuple[NDArray[np.generic], ...]] = []
     for index, view in enumerate(views):
-        centre = view.centre
-        normals = tangent_normals(cylinder.start, axis, cylinder.radius, centre)
-        if normals is None:
-            continue
-        rotation = view.camera_from_map[:3, :3]
-        inverse = np.linalg.inv(view.camera.matrix)
-        on_axis = cylinder.start + fractions[:, None] * (length * axis)
-        for side, normal in enumerate(normals):
-            line = inverse.T @ (rotation @ normal)
-            slope = float(np.hypot(line[0], line[1]))
-            pixel, depth = project(view, on_axis - cylinder.radius * normal)
-            inside = (
-                (depth > 0.05)
-                & (pixel[:, 0] > margin)
-                & (pixel[:, 0] < view.camera.width - 1 - margin)
-                & (pixel[:, 1] > margin)
-                & (pixel[:, 1] < view.camera.height - 1 - margin)
-            )
-            if not inside.any() or slope < 1e-12:
-                continue
-            gain = 1.0 / (depth[inside] * slope)
-            share = fractions[inside]
-            sideways = -(basis @ normal)
-            jacobian = gain[:, None] * np.concatenate(
-                [
-                    (1.0 - share)[:, None] * sideways,
-                    share[:, None] * sideways,
-                    np.ones((len(share), 1)),
-                ],
-                axis=1,
-            )
-            total = int(inside.sum())
-            parts.append(
-                (
-                    np.full(total, index),
-                    np.full(total, side),
-                    pixel[inside],
-                    np.broadcast_to(-line[:2] / slope, (total, 2)),
-                    (share - 0.5) * length,
-                    gain,
-                    gain * cylinder.radius,
-                    jacobian,
-                )
-            )
+        for side, columns in _sides(cylinder, view, basis, fractions, margin):
+            total = len(columns[0])
+            parts.append((np.full(total, index), np.full(total, side), *columns))
     if not parts:
         empty = np.zeros(0)
         none = np.zeros(0, int)
-        return Stations(none, none, np.zeros((0, 2)), np.zeros((0, 2)), empty, empty, empty, np.zeros((0, 5)))
-    return Stations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        return ContourSamples(none, none, np.zeros((0, 2)), np.zeros((0, 2)), empty, empty, empty, np.zeros((0, 5)))
+    return ContourSamples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def visible(
-    cylinder: Cylinder, others: Sequence[Cylinder], views: Sequence[View], at: Stations, margin: float = 3.0
-) -> NDArray[np.bool_]:
-    """Mask (N,): stations that neither another cylinder, grown by `margin` pixels, nor the cloud hides from a view."""
-    result = np.ones(len(at), bool)
-    for index, view in enumerate(views):
-        chosen = np.flatnonzero(at.view == index)
-        if len(chosen):
-            on_axis = cylinder.middle + at.along[chosen, None] * cylinder.axis
-            depth = (on_axis - view.centre) @ view.camera_from_map[2, :3]
-            result[chosen] = ~hidden(view, at.pixel[chosen], depth, others, margin)
-            result[chosen] &= ~behind(view, at.pixel[chosen], depth - cylinder.radius)
-    return result
+def _sides(
+    cylinder: Cylinder, view: View, basis: FloatArray, fractions: FloatArray, margin: float
+) -> Iterator[tuple[int, tuple[FloatArray, ...]]]:
+    """The sides that a view shows, each with the columns of `ContourSamples` from `pixel` on.
 
-
-def hidden(
-    view: View, pixel: FloatArray, depth: FloatArray, others: Sequence[Cylinder], margin: float = 3.0
-) -> NDArray[np.bool_]:
-    """Which points (N,), seen at pixel (N, 2) at depth (N,) [m], lie behind a cylinder grown by `margin` pixels."""
-    result = np.zeros(len(depth), bool)
-    camera, centre = view.camera, view.centre
-    rays = np.stack(
-        [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(depth))], axis=1
-    )
-    rays = rays @ view.camera_from_map[:3, :3]
-    for other in others:
-        result |= _hidden_by(other, centre, rays, depth, margin / camera.fx)
-    return result
-
-
-def _hidden_by(
-    other: Cylinder, centre: FloatArray, rays: FloatArray, own_depth: FloatArray, margin: float
-) -> NDArray[np.bool_]:
-    """Rays (N, 3) with unit depth that pass `other`, grown by `margin` x depth, before `own_depth`."""
-    axis = other.axis
-    offset = other.start - centre
-    offset_across = offset - axis * (axis @ offset)
-    rays_along = rays @ axis
-    rays_across = rays - rays_along[:, None] * axis
-    square = np.maximum(np.einsum("ij,ij->i", rays_across, rays_across), 1e-12)
-    depth = rays_across @ offset_across / square
-    miss = offset_across - depth[:, None] * rays_across
-    along = depth * rays_along - axis @ offset
-    reach = other.radius + margin * np.abs(depth)
-    near = np.einsum("ij,ij->i", miss, miss) < reach**2
-    return near & (depth > 0) & (depth < own_depth) & (along > -reach) & (along < other.length + reach)
-
-
-def outline(cylinder: Cylinder, view: View) -> FloatArray:
-    """The two outlines as image segments (2, 2, 2): [side, end, (x, y)] in pixels, not clipped to the image.
-
-    Raises ValueError where the camera stands inside the cylinder's infinite extension or a segment passes behind it.
+    The Jacobian is exact: displacing the surface by d along its outward normal at the contact generator moves the
+    line by d / (depth |l|) pixels, l being the image line of the tangent plane (envelope theorem).
     """
-    normals = tangent_normals(cylinder.start, cylinder.axis, cylinder.radius, view.centre)
+    normals = tangent_normals(cylinder, view.centre)
     if normals is None:
-        raise ValueError("the camera lies inside the cylinder: it has no outline")
-    result = np.empty((2, 2, 2))
+        return
+    length = cylinder.length
+    rotation = view.camera_from_map[:3, :3]
+    inverse = np.linalg.inv(view.camera.matrix)
+    on_axis = cylinder.start + fractions[:, None] * (length * cylinder.axis)
+    size = np.array([view.camera.width, view.camera.height])
     for side, normal in enumerate(normals):
-        ends = np.stack([cylinder.start, cylinder.end]) - cylinder.radius * normal
-        pixel, depth = project(view, ends)
-        if (depth <= 0).any():
-            raise ValueError("the cylinder passes behind the camera")
-        result[side] = pixel
-    return result
+        line = inverse.T @ (rotation @ normal)
+        slope = float(np.hypot(line[0], line[1]))
+        pixel, depth = project(view, on_axis - cylinder.radius * normal)
+        within = (depth > NEAR_PLANE) & (pixel > margin).all(axis=1) & (pixel < size - 1 - margin).all(axis=1)
+        if not within.any() or slope < 1e-12:
+            continue
+        gain = 1.0 / (depth[within] * slope)
+        share = fractions[within]
+        sideways = -(basis @ normal)
+        moves = [(1.0 - share)[:, None] * sideways, share[:, None] * sideways, np.ones((len(share), 1))]
+        jacobian = gain[:, None] * np.concatenate(moves, axis=1)
+        outward = np.broadcast_to(-line[:2] / slope, (len(share), 2))
+        yield side, (pixel[within], outward, (share - 0.5) * length, gain, gain * cylinder.radius, jacobian)

@@ -1,4 +1,4 @@
-"""Where along a pipe its outlines are seen: verifies detections, and shows where the straight barrel stops."""
+"""Support: the share of a cylinder's visible contour samples at which several views show a limb edge."""
 
 from __future__ import annotations
 
@@ -10,28 +10,37 @@ from numpy.typing import NDArray
 from scipy.special import betainc
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import Stations, frame, viewing_direction
-from pipeprog_detect.silhouette.limb_edges import SHARP, LimbEdges, outline_edges, sideways
+from pipeprog_detect.silhouette.apparent_contour import ContourSamples
+from pipeprog_detect.silhouette.limb_edges import LimbEdges
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 
-# An edge supports an outline that it meets within the sharpness of the image [px], ...
+# An edge supports a contour sample where it lies within the sharpness of the image [px], ...
 NEAR = 0.6
-# ... that is placed to better than that, and that explains more than texture does of what a smooth profile leaves.
+# ... is placed to better than that [px], and explains more of what a smooth profile leaves than texture does.
 SIGMA, EXPLAINED = 0.4, 0.2
-# A shadow's or a texture's edge agrees with the outline by chance in some views, but not in three and most of them.
+# A shadow's or a texture's edge agrees with a contour by chance in some views, but not in three and half of them.
 MIN_VIEWS, MIN_SHARE = 3, 0.5
-# Contrast and texture leave a view an edge at so much of a real outline (hit rate at the pipes of a generated field,
-# median; beside them 0.09). Of three views all must show it, which happens at a third of the places only.
+# Share of the views that show an edge at one position of a real contour; contrast and texture cost the rest. Of three
+# views all must show it, which then happens at a third of the positions. MeasuredPipe, not derived: the median at the
+# pipes of a rendered field, where the rate beside them is 0.09.
 HIT_RATE = 0.7
-# Nine in ten of the pipes of a generated field reach 0.55, nine in ten cylinders beside them that are not there stay
-# under 0.1: the geometric mean, since what was fitted to clutter finds more of it. The stated sigma of a radius grows
-# where little is seen.
+# Support of what is taken for seen: the geometric mean of 0.55, which nine in ten of the pipes of that field reach, and
+# of 0.1, under which nine in ten cylinders stay that are placed beside them. MeasuredPipe there as well.
 MIN_SUPPORT = 0.25
+# Distance from the predicted contour within which its support is counted [px].
+REACH = 1.5
 
 
 @dataclass(frozen=True)
 class SupportProfile:
-    """Support by position: `along` (B,) from the cylinder's middle [m], and for each side (B, 2) views and hits."""
+    """Support by position along a cylinder.
+
+    Attributes:
+        along: position (B,) from the cylinder's middle [m].
+        seen: number (B, 2) of views that see each side there.
+        hits: number (B, 2) of those that show a limb edge there.
+    """
 
     along: FloatArray
     seen: FloatArray
@@ -39,67 +48,60 @@ class SupportProfile:
 
     @property
     def share(self) -> float:
-        """Share (0 to 1) of the outline, where three views or more see it, with an edge in three and in most of them.
+        """Share (0 to 1) of the positions, seen by three views or more, with an edge in three and in half of them.
 
-        As a share of what so many views show of a real outline on average, so that few views count as well as many.
+        Relative to the share that as many views show of a real contour on average, so that three views count as well
+        as thirty.
         """
         supported, expected = self._by_side()
         return min(float(supported.sum() / expected.sum()), 1.0) if expected.any() else 0.0
 
     @property
     def weaker_share(self) -> float:
-        """The same of the outline on that side that has less of it; of the only one where views see no other."""
+        """The same on the side that has less of it; on the only one where the views see no other."""
         supported, expected = self._by_side()
         return min(float((supported[expected > 0] / expected[expected > 0]).min()), 1.0) if expected.any() else 0.0
 
     def _by_side(self) -> tuple[FloatArray, FloatArray]:
-        """Places of each side (2,) that have such edges, and places of a real outline that would have."""
+        """Number of positions of each side (2,) with such edges, and the number expected of a real contour."""
         needed = np.maximum(np.ceil(MIN_SHARE * self.seen), MIN_VIEWS)
         tail = betainc(needed, np.maximum(self.seen - needed, 0.0) + 1.0, HIT_RATE)  # of the binomial distribution
         expected = np.where(self.seen >= needed, tail, 0.0)
         return (self.hits >= needed).sum(axis=0).astype(float), expected.sum(axis=0)
 
 
-def hits(at: Stations, edges: LimbEdges, view_offset: FloatArray) -> NDArray[np.bool_]:
-    """Mask (N,) of the stations whose outline an edge supports."""
-    distance = np.abs(edges.offset - (sideways(at) * view_offset[at.view])[:, None])
+def hits(samples: ContourSamples, edges: LimbEdges, view_offset: FloatArray) -> NDArray[np.bool_]:
+    """Mask (N,) of the samples that an edge supports, the contour being shifted by the views' offsets (V,) [px]."""
+    distance = np.abs(edges.offset - (samples.sideways() * view_offset[samples.view])[:, None])
     good = (distance < NEAR) & (edges.sigma < SIGMA) & (edges.explained > EXPLAINED)
     return np.asarray(good.any(axis=1), bool)
 
 
-def support_profile(at: Stations, hit: NDArray[np.bool_]) -> SupportProfile:
-    """Hits counted by position along the axis and side."""
-    along, place = np.unique(np.round(at.along, 6), return_inverse=True)
-    cell = 2 * place + at.side
+def support_profile(samples: ContourSamples, hit: NDArray[np.bool_]) -> SupportProfile:
+    """Hits (N,) counted by position along the axis and side."""
+    along, position = samples.positions()
+    cell = 2 * position + samples.side
     seen = np.bincount(cell, np.ones(len(cell)), 2 * len(along)).reshape(-1, 2)
     found = np.bincount(cell, hit.astype(float), 2 * len(along)).reshape(-1, 2)
     return SupportProfile(along, np.asarray(seen, float), np.asarray(found, float))
 
 
-def outline_support(
-    cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], chunk: int = 12
-) -> SupportProfile:
-    """Support of a cylinder's predicted outlines by the edges near them."""
-    basis = frame(cylinder, viewing_direction(cylinder, views))
-    none = np.zeros(len(views))
-    at, edges = outline_edges(cylinder, views, others, basis, none, 1.5, SHARP, chunk)
-    return support_profile(at, hits(at, edges, none))
+def contour_support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> SupportProfile:
+    """Support of a cylinder's predicted contour by the edges near it; `others` may hide it."""
+    scene = Scene.of(cylinder, views, others)
+    samples, edges = scene.edges(cylinder, REACH)
+    return support_profile(samples, hits(samples, edges, scene.view_offset))
 
 
-def support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> float:
-    """Share (0 to 1) of the cylinder's predicted outline with a supporting edge in at least three and most views."""
-    return outline_support(cylinder, views, others).share
+def own_contours(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArray[np.bool_]:
+    """Mask (N,) of the cylinders whose contours are their own once all of them are known.
 
-
-def own_outlines(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArray[np.bool_]:
-    """Mask (N,): cylinders whose outlines are their own once all of them are known.
-
-    A cylinder that was measured before the one that hides it was found may have taken that one's edges for its
-    outlines: they leave it with less than a cylinder that is not there has.
+    A cylinder that was measured before the one that hides it was found may have been fitted to that one's edges:
+    without them its support falls below `MIN_SUPPORT`. One that never had that support is not judged by it.
     """
     kept = np.ones(len(cylinders), bool)
     for number, cylinder in enumerate(cylinders):
         others = [other for k, other in enumerate(cylinders) if k != number and kept[k]]
-        shown = support(cylinder, views, others)
-        kept[number] = shown >= MIN_SUPPORT or support(cylinder, views, []) < MIN_SUPPORT
+        if contour_support(cylinder, views, others).share < MIN_SUPPORT:
+            kept[number] = contour_support(cylinder, views, []).share < MIN_SUPPORT
     return kept

@@ -1,48 +1,52 @@
-"""How far a pipe goes on beyond what is known of it: along its axis while the keyframes show its outlines."""
+"""How far a pipe goes on beyond its known part: along its axis, while the keyframes show its contour."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import frame, viewing_direction
 from pipeprog_detect.silhouette.edge_support import SupportProfile, hits, support_profile
-from pipeprog_detect.silhouette.limb_edges import outline_edges
-from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.types import Cylinder
 
-# A known length tells the direction well enough to look this far ahead, in its own lengths and in metres.
+# A known length tells the direction well enough to look this far ahead: in its own lengths, and at most in metres.
 AHEAD, FARTHEST = 1.0, 1.5
-# Pixels between the places looked at, and the stations that suffice for one end, and for a rate beside it.
-SPACING, STATIONS, STATIONS_BESIDE = 6, 2400, 600
-# Pixels beside the pipe where texture alone is seen, and by how much the pipe's rate must surpass that.
+# Spacing of the contour samples [px], and how many suffice along one end and along one line beside it.
+SPACING, SAMPLES, SAMPLES_BESIDE = 6, 2400, 600
+# Distance beside the pipe at which texture alone is seen [px], and by how much the pipe's rate of edges must exceed
+# that of texture.
 BESIDE, LEAST_CONTRAST = 4.0, 0.15
-# Where little is seen beside the pipe, texture is taken to show edges at this rate, as if so many had been looked at.
+# Rate of edges of texture, and the number of samples that this prior weighs: it counts where little is seen beside.
 TEXTURE, TEXTURE_SEEN = 0.2, 20.0
-# Of what one place shows so much is common to all views: a speck of texture, a dark stretch.
+# Correlation between views of the evidence at one position: specks of texture and dark areas are common to them.
 COMMON = 0.3
-# Outlines differ along a pipe: a place without edges speaks no louder against it than one with edges for it.
+# Bounds of the rates: contours differ along a pipe, so that neither an edge nor its absence is ever certain evidence.
 LEAST_RATE, MOST_RATE = 0.02, 0.9
-# Logarithm of the odds that make a further stretch certain: texture is taken for it once in a thousand times.
+# Logarithm of the odds from which a further stretch is taken for the pipe's: wrong once in a thousand times.
 CERTAIN = 7.0
-# Stations that make a known stretch.
+# Samples that make a known stretch.
 MIN_SAMPLES = 10
-# Bare outlines end it, but for a clamp of so many radii or metres; what is hidden may be as long as an occluder.
+# A stretch without edges ends the pipe if it is longer than a clamp: in radii, and at least in metres. A hidden stretch
+# may be as long as what hides it [m].
 CLAMP_RADII, CLAMP, HIDDEN = 3.0, 0.06, 0.3
-# Growth by less than this is left to the rims [m].
+# Extension by less than this is left to the search for the end rim [m].
 LEAST = 0.04
-# The direction's error, at the end of the stretch looked at, moves the outlines by less than this [px].
+# The direction's error, at the end of the stretch looked at, moves the contour by less than this [px].
 TOLERANCE = 1.5
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What the outlines say at places `along` (N,) [m] outwards from an end of a pipe, those inside it negative.
+class AxialEvidence:
+    """What the contour tells at positions along the axis, outwards from an end of a pipe.
 
-    `log_odds` (N,): logarithm of how much more probable the edges seen there are on the pipe than beside it, 0 where
-    nothing is seen; `seen` (N,): stations seen in all views.
+    Attributes:
+        along: position (N,) [m]; those inside the end are negative.
+        log_odds: logarithm (N,) of how much more probable the edges seen there are on the pipe than beside it; 0 where
+            nothing is seen.
+        seen: number (N,) of samples seen there in all views.
     """
 
     along: FloatArray
@@ -50,52 +54,39 @@ class Evidence:
     seen: FloatArray
 
 
-def grown(
-    cylinder: Cylinder,
-    views: Sequence[View],
-    others: Sequence[Cylinder],
-    view_offset: FloatArray,
-    blur: float,
-) -> Cylinder:
-    """The cylinder, as long as its outlines are seen; the same one where nothing is to be added.
+def extended(cylinder: Cylinder, scene: Scene) -> Cylinder:
+    """The cylinder, as long as its contour is seen; the same one where nothing is to be added.
 
-    What hides the pipe is no evidence against it.
+    Where something hides the pipe there is no evidence against it.
     """
     ahead = min(AHEAD * cylinder.length, FARTHEST)
     ends = []
     for at_end in (False, True):
-        evidence = outline_evidence(cylinder, at_end, ahead, views, others, view_offset, blur)
+        evidence = axial_evidence(cylinder, at_end, ahead, scene)
         further = 0.0 if evidence is None else _further(evidence, max(CLAMP_RADII * cylinder.radius, CLAMP))
         ends.append(cylinder.end + further * cylinder.axis if at_end else cylinder.start - further * cylinder.axis)
     return Cylinder(ends[0], ends[1], cylinder.radius)
 
 
-def outline_evidence(
-    cylinder: Cylinder,
-    at_end: bool,
-    ahead: float,
-    views: Sequence[View],
-    others: Sequence[Cylinder],
-    view_offset: FloatArray,
-    blur: float,
-) -> Evidence | None:
-    """The evidence of the outlines up to `ahead` [m] beyond an end; None where the pipe does not stand out.
+def axial_evidence(cylinder: Cylinder, at_end: bool, ahead: float, scene: Scene) -> AxialEvidence | None:
+    """The evidence of the contour up to `ahead` [m] beyond an end; None where the pipe does not stand out.
 
-    Edges lie on the pipe's outlines as often as on its known half, and as often as beside it on what is no pipe.
+    The pipe's contour shows edges as often as on the known half next to that end; what is no pipe shows them as often
+    as the lines beside it.
     """
     axis, end = (cylinder.axis, cylinder.end) if at_end else (-cylinder.axis, cylinder.start)
     back = min(0.5 * cylinder.length, 0.5 * FARTHEST)
-    basis = frame(cylinder, viewing_direction(cylinder, views))
+    scene = scene.turned_to(cylinder)
 
     def profile(aside: float, inner: float, limit: int) -> tuple[SupportProfile | None, float]:
-        shift = aside * basis[0]
+        shift = aside * scene.basis[0]
         stretch = Cylinder(end - inner * axis + shift, end + ahead * axis + shift, cylinder.radius)
-        at, edges = outline_edges(stretch, views, others, basis, view_offset, TOLERANCE, blur, SPACING, limit)
-        if not len(at):
+        samples, edges = scene.edges(stretch, TOLERANCE, SPACING, limit)
+        if not len(samples):
             return None, 0.0
-        return support_profile(at, hits(at, edges, view_offset)), float(np.median(at.gain))
+        return support_profile(samples, hits(samples, edges, scene.view_offset)), float(np.median(samples.gain))
 
-    on, gain = profile(0.0, back, STATIONS)
+    on, gain = profile(0.0, back, SAMPLES)
     if on is None:
         return None
     along = on.along + 0.5 * (ahead - back)
@@ -103,8 +94,16 @@ def outline_evidence(
     if on.seen[known].sum() < MIN_SAMPLES:
         return None
     aside = 2.0 * cylinder.radius + BESIDE / gain
-    flanks = [profile(sign * aside, 0.0, STATIONS_BESIDE)[0] for sign in (-1.0, 1.0)]
-    beside = [each for each in flanks if each is not None]
+    beside = [profile(sign * aside, 0.0, SAMPLES_BESIDE)[0] for sign in (-1.0, 1.0)]
+    log_odds = _log_odds(on, known, [each for each in beside if each is not None])
+    return None if log_odds is None else AxialEvidence(along, log_odds, on.seen.sum(axis=1))
+
+
+def _log_odds(on: SupportProfile, known: NDArray[np.bool_], beside: list[SupportProfile]) -> FloatArray | None:
+    """The logarithm (N,) of the odds that edges are the pipe's; None where it shows hardly more than lines beside it.
+
+    The rate of edges on the pipe is that of its `known` positions (N,).
+    """
     found, looked = (sum(float(getattr(each, name).sum()) for each in beside) for name in ("hits", "seen"))
     chance = (found + TEXTURE * TEXTURE_SEEN) / (looked + TEXTURE_SEEN)
     rate = on.hits[known].sum(axis=0) / np.maximum(on.seen[known].sum(axis=0), 1.0)
@@ -114,11 +113,11 @@ def outline_evidence(
     share = on.hits / np.maximum(on.seen, 1.0)
     count = on.seen / (1.0 + COMMON * np.maximum(on.seen - 1.0, 0.0))
     against = np.log((1.0 - rate) / (1.0 - max(chance, LEAST_RATE)))
-    log_odds = (count * (share * np.log(rate / max(chance, LEAST_RATE)) + (1.0 - share) * against)).sum(axis=1)
-    return Evidence(along, log_odds, on.seen.sum(axis=1))
+    odds = count * (share * np.log(rate / max(chance, LEAST_RATE)) + (1.0 - share) * against)
+    return np.asarray(odds.sum(axis=1), np.float64)
 
 
-def _further(evidence: Evidence, clamp: float) -> float:
+def _further(evidence: AxialEvidence, clamp: float) -> float:
     """How far [m] the pipe goes on: to where the evidence for it is greatest, 0 where it is not certain."""
     beyond = evidence.along > 0
     along, log_odds, seen = evidence.along[beyond], evidence.log_odds[beyond], evidence.seen[beyond]
@@ -126,9 +125,9 @@ def _further(evidence: Evidence, clamp: float) -> float:
         return 0.0
     step = float(along[1] - along[0])
     total = most = last = bare = shown = 0.0
-    for here, odds, stations in zip(along.tolist(), log_odds.tolist(), seen.tolist(), strict=True):
+    for here, odds, samples in zip(along.tolist(), log_odds.tolist(), seen.tolist(), strict=True):
         total += odds
-        bare = bare + step if stations and odds < 0 else 0.0 if odds > 0 else bare
+        bare = bare + step if samples and odds < 0 else 0.0 if odds > 0 else bare
         shown += step if odds > 0 else 0.0
         if bare > clamp + 2.0 * step or here - last > HIDDEN + shown:
             break

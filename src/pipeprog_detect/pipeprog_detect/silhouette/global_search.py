@@ -1,8 +1,6 @@
-"""Which cylinder the edges of all views agree on: an exhaustive vote, so that no single strong edge decides."""
+"""Which cylinder the edges of all views agree on: a search of the whole range, so that no strong edge decides alone."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
@@ -11,41 +9,54 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.stats import qmc
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import Stations
-from pipeprog_detect.silhouette.limb_edges import WINDOW_OF_HALF_WIDTH, profiles
-from pipeprog_detect.types import View
+from pipeprog_detect.silhouette.apparent_contour import ContourSamples
+from pipeprog_detect.silhouette.limb_edges import WINDOW_OF_HALF_WIDTH
+from pipeprog_detect.silhouette.scene import SPACING, Scene
+
+# Samples that the search scores; more only take longer.
+MOST_SAMPLES = 1500
+# Steps of the first round (a power of two, as Sobol's sequence wants), and those that survive a round and spread anew.
+FIRST_ROUND, ELITES, OFFSPRING = 8192, 96, 32
+# Half-width of the smeared edges in the first round, as a share of the pipe's half-width, and their least one [px].
+FIRST_SMEAR, LEAST_SMEAR = 0.12, 1.0
+# Spread of the offspring in the second round, as a share of the range, and its decrease from round to round. It ends
+# below a fifth of a pixel: sub-pixel edges tell what is left.
+FIRST_SPREAD, DECREASE, LAST_SPREAD = 0.2, 0.6, 0.2
+# Rivals are kept alive: no more survivors than this move the contour into the same cell of this size [px].
+CROWD, CELL = 16, 2.0
 
 
-def vote(
-    views: Sequence[View],
-    at: Stations,
+def best_steps(
+    scene: Scene,
+    samples: ContourSamples,
     reach: FloatArray,
     furthest: float,
-    half_chunk: int,
     seeds: FloatArray | None = None,
 ) -> FloatArray:
-    """Steps (E, 5) of `outline.moved` within +-`reach` (5,) [m] that most edges of all views support, best first.
+    """Steps (E, 5) of `Scene.moved` within +-`reach` (5,) [m] that most edges of all views support, best first.
 
-    `at`: the outlines before the step, which moves them by `furthest` [px] at most. `seeds` (S, 5) are tried, too.
+    Args:
+        samples: of the contour before the step (`MOST_SAMPLES` suffice), which moves them by `furthest` [px] at most.
+        seeds: further steps (S, 5) that are tried.
     """
-    furthest = min(float(at.half_width.max()) * WINDOW_OF_HALF_WIDTH, furthest)
-    spacing = float(np.clip(np.median(at.half_width) / 16.0, 0.25, 1.0))
+    furthest = min(float(samples.half_width.max()) * WINDOW_OF_HALF_WIDTH, furthest)
+    spacing = float(np.clip(np.median(samples.half_width) / 16.0, 0.25, 1.0))
     offsets = np.arange(-np.ceil(furthest / spacing) - 2, np.ceil(furthest / spacing) + 3) * spacing
-    response = responses(profiles(views, at, offsets, half_chunk), offsets, at)
+    response = _responses(scene.light(samples, offsets, SPACING // 2), offsets, samples)
     none = np.zeros((0, 5))
-    return search(at, response, offsets, reach, none if seeds is None else seeds, np.random.default_rng(0))
+    return _annealed(samples, response, offsets, reach, none if seeds is None else seeds)
 
 
-def responses(values: NDArray[np.floating], offsets: FloatArray, at: Stations) -> NDArray[np.float32]:
+def _responses(values: NDArray[np.floating], offsets: FloatArray, samples: ContourSamples) -> NDArray[np.float32]:
     """Peaks of the gradient along profiles `values` (N, Q): (N, Q) float32, 0 where none, up to 1 for a clear one.
 
-    Strength saturates at the median of all peaks: where a shadow's edge is ten times stronger than the outline, both
-    count about alike, and agreement over the views decides between them.
+    Strength saturates at the median of all peaks: a shadow's edge ten times stronger than the contour's counts about
+    the same, and agreement over the views decides between them.
     """
     slope = np.abs(gaussian_filter1d(np.asarray(values, float), 0.7 / (offsets[1] - offsets[0]), axis=1, order=1))
     inner = slope[:, 1:-1]
     peak = (inner >= slope[:, :-2]) & (inner > slope[:, 2:])
-    peak &= np.abs(offsets[None, 1:-1]) <= WINDOW_OF_HALF_WIDTH * at.half_width[:, None]
+    peak &= np.abs(offsets[None, 1:-1]) <= WINDOW_OF_HALF_WIDTH * samples.half_width[:, None]
     result = np.zeros(values.shape, np.float32)
     if peak.any():
         typical = np.median(inner[peak])
@@ -53,8 +64,10 @@ def responses(values: NDArray[np.floating], offsets: FloatArray, at: Stations) -
     return result
 
 
-def smeared(response: NDArray[np.float32], offsets: FloatArray, at: Stations, width: float) -> NDArray[np.float32]:
-    """Responses (N, Q) spread by a triangle of half-width `width` px and made neutral: mean 0 inside each window."""
+def _smeared(
+    response: NDArray[np.float32], offsets: FloatArray, samples: ContourSamples, width: float
+) -> NDArray[np.float32]:
+    """Responses (N, Q) spread by a triangle of half-width `width` [px], with mean 0 inside each window."""
     step = offsets[1] - offsets[0]
     taps = np.arange(-int(width / step), int(width / step) + 1) * step
     result = np.zeros_like(response)
@@ -62,7 +75,7 @@ def smeared(response: NDArray[np.float32], offsets: FloatArray, at: Stations, wi
         shift = round(tap / step)
         part = np.roll(response, shift, axis=1) * np.float32(1.0 - abs(tap) / (width + step))
         np.maximum(result, part, out=result)
-    window = np.abs(offsets[None]) <= WINDOW_OF_HALF_WIDTH * at.half_width[:, None]
+    window = np.abs(offsets[None]) <= WINDOW_OF_HALF_WIDTH * samples.half_width[:, None]
     mean = (result * window).sum(axis=1) / np.maximum(window.sum(axis=1), 1)
     return np.where(window, result - mean[:, None], np.float32(0.0)).astype(np.float32)
 
@@ -71,7 +84,7 @@ def smeared(response: NDArray[np.float32], offsets: FloatArray, at: Stations, wi
 def _scores(
     steps: FloatArray, jacobian: FloatArray, response: NDArray[np.float32], first: float, step: float
 ) -> FloatArray:
-    """Sum over stations of the response at the displacement that each step (M, 5) causes there."""
+    """Sum over samples of the response at the displacement that each step (M, 5) causes there."""
     result = np.zeros(len(steps))
     last = response.shape[1] - 1
     for m in range(len(steps)):
@@ -89,65 +102,59 @@ def _scores(
     return result
 
 
-def search(
-    at: Stations,
-    response: NDArray[np.float32],
-    offsets: FloatArray,
-    reach: FloatArray,
-    seeds: FloatArray,
-    random: np.random.Generator,
-    elites: int = 96,
-    offspring: int = 32,
+def _annealed(
+    samples: ContourSamples, response: NDArray[np.float32], offsets: FloatArray, reach: FloatArray, seeds: FloatArray
 ) -> FloatArray:
     """Best steps (E, 5) within +-`reach` (5,) [m], best first.
 
-    A Sobol grid over the whole box is scored against widely smeared edges; the best are spread again and again with
-    half the step and half the smear (annealing) down to a third of a pixel. `seeds` (S, 5) join the first grid.
+    Points of Sobol's sequence all over the range, and the `seeds` (S, 5), are scored against widely smeared edges; the
+    best spread again and again, less from round to round, over edges that are smeared less (annealing).
     """
-    gain = float(np.median(at.gain))
-    half_width = float(np.median(at.half_width))
-    grid = qmc.Sobol(5, seed=random).random(8192) * 2.0 - 1.0
+    random = np.random.default_rng(0)
+    gain = float(np.median(samples.gain))
+    half_width = float(np.median(samples.half_width))
+    grid = qmc.Sobol(5, seed=random).random(FIRST_ROUND) * 2.0 - 1.0
     population = np.concatenate([np.zeros((1, 5)), seeds, grid * reach])
-    outlines = np.stack([at.jacobian[at.side == side].mean(axis=0) for side in (0, 1)], axis=1)
-    width = max(0.12 * half_width, 1.0)
-    spread = 0.2 * reach
+    lines = np.stack([samples.jacobian[samples.side == side].mean(axis=0) for side in (0, 1)], axis=1)
+    width = max(FIRST_SMEAR * half_width, LEAST_SMEAR)
+    spread = FIRST_SPREAD * reach
     first, step = float(offsets[0]), float(offsets[1] - offsets[0])
     while True:
-        smear = smeared(response, offsets, at, width)
-        score = _scores(population, at.jacobian, smear, first, step)
+        smear = _smeared(response, offsets, samples, width)
+        score = _scores(population, samples.jacobian, smear, first, step)
         order = np.argsort(-score, kind="stable")
-        population = population[order[_niched(population[order] @ outlines, elites)]]
-        if spread.max() * gain < 0.2:
+        population = population[order[_survivors(population[order] @ lines)]]
+        if spread.max() * gain < LAST_SPREAD:
             return population
-        cloud = random.normal(size=(len(population), offspring, 5)) * spread
-        children = np.clip(population[:, None] + cloud, -reach, reach).reshape(-1, 5)
+        scatter = random.normal(size=(len(population), OFFSPRING, 5)) * spread
+        children = np.clip(population[:, None] + scatter, -reach, reach).reshape(-1, 5)
         population = np.concatenate([population, children])
-        spread = 0.6 * spread
-        width = max(0.6 * width, 1.0)
+        spread = DECREASE * spread
+        width = max(DECREASE * width, LEAST_SMEAR)
 
 
-def _niched(displacement: FloatArray, count: int, cell: float = 2.0, crowd: int = 16) -> NDArray[np.int64]:
-    """Indices of the first `count` of displacements (M, 2) px with no more than `crowd` in one cell of `cell` px.
+def _survivors(displacement: FloatArray) -> NDArray[np.int64]:
+    """Indices of the first `ELITES` of displacements (M, 2) [px] with no more than `CROWD` in one cell.
 
-    Keeps rival hypotheses alive, such as an outline and a shadow's edge beside it, until sub-pixel edges decide.
+    Keeps rivals alive, such as a contour and a shadow's edge beside it, until sub-pixel edges decide.
     """
-    place = np.round(displacement / cell).astype(np.int64)
+    place = np.round(displacement / CELL).astype(np.int64)
     _, cells = np.unique(place, axis=0, return_inverse=True)
     order = np.argsort(cells.ravel(), kind="stable")
     ordered = cells.ravel()[order]
     first = np.r_[0, np.flatnonzero(np.diff(ordered)) + 1]
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order)) - np.repeat(first, np.diff(np.r_[first, len(order)]))
-    return np.flatnonzero(rank < crowd)[:count]
+    return np.flatnonzero(rank < CROWD)[:ELITES]
 
 
-def distinct(population: FloatArray, at: Stations, apart: float, limit: int) -> FloatArray:
-    """The first steps (K <= limit, 5) of a population, best first, whose outlines differ by `apart` px rms or more."""
-    displaced = population @ at.jacobian.T
+def distinct(steps: FloatArray, samples: ContourSamples, apart: float, limit: int) -> FloatArray:
+    """The first steps (K <= limit, 5), best first, whose contours differ by `apart` [px] rms or more."""
+    displaced = steps @ samples.jacobian.T
     kept: list[int] = []
-    for index in range(len(population)):
+    for index in range(len(steps)):
         if all(np.sqrt(np.mean((displaced[index] - displaced[other]) ** 2)) >= apart for other in kept):
             kept.append(index)
         if len(kept) == limit:
             break
-    return population[kept]
+    return steps[kept]

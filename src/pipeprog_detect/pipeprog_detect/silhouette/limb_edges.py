@@ -1,30 +1,26 @@
-"""Sub-pixel edges of limbs: a blurred model of the surface that curves away and of what lies behind it."""
+"""Sub-pixel limb edges: a blurred model of the surface that curves away and of what lies behind it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import Stations, stations, visible
-from pipeprog_detect.types import Cylinder, View
 
-# The limb model's window: inwards as far as shading stays smooth; outwards, beyond the blur, to where the next thing
-# may begin [px].
-INWARD, OUTWARD, OUTWARD_OF_BLUR = 8.0, 1.5, 3.0
-# A line belongs to one side of the pipe only while it is nearer to it than to the axis.
+# Half of the width of the limb model's window inside the pipe [px]: shading stays smooth so far.
+INWARD = 8.0
+# A line belongs to one side of the pipe only while it is nearer to it than to the axis (share of the half width).
 WINDOW_OF_HALF_WIDTH = 0.8
-# Blur of a sharp image, lens and pixel together, and the ones that are tried [px].
-SHARP = 0.5
-BLURS = np.array([0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.5])
-# Profiles that are compared with the model at a time: some megabytes.
+# Step of the trial positions [px] (the minimum is refined by a parabola), and edges of one profile that are kept: limb,
+# highlight and shadow.
+TRIAL_STEP, MOST_EDGES = 0.1, 3
+# Profiles that are compared with the model at a time: an array of 2 MB.
 _BLOCK = 1024
-# Share of Schlick's reflectance that a painted or a rough metal surface keeps at grazing incidence.
+# Share of Schlick's reflectance that a painted or a rough metal surface keeps at grazing incidence: between none (matt)
+# and a half (gloss); the tests hold that either moves the edge by less than 0.09 px.
 RIM = 0.25
 
 
@@ -38,46 +34,23 @@ def _linear_light() -> NDArray[np.float32]:
 LINEAR_LIGHT = _linear_light()
 
 
-def profiles(views: Sequence[View], at: Stations, offsets: FloatArray, rows: int) -> NDArray[np.float32]:
-    """Light (N, Q) float32, 0 ... 255, along the outward normals at `offsets` (Q,) px, the mean of `rows` such lines.
-
-    Samples outside the image repeat its border.
-    """
-    result = np.empty((len(at), len(offsets)), np.float32)
-    shifts = np.arange(rows) - 0.5 * (rows - 1)
-    for index, view in enumerate(views):
-        chosen = np.flatnonzero(at.view == index)
-        if not len(chosen):
-            continue
-        pixel, normal = at.pixel[chosen], at.normal[chosen]
-        tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-        feet = (pixel[:, None] + shifts[None, :, None] * tangent[:, None]).reshape(-1, 2)
-        outward = np.repeat(normal, rows, axis=0)
-        size = np.array([view.camera.width, view.camera.height])
-        tips = np.stack([feet + offsets[0] * outward, feet + offsets[-1] * outward])
-        low = np.clip(np.floor(tips.min(axis=(0, 1))).astype(int) - 2, 0, size - 1)
-        high = np.clip(np.ceil(tips.max(axis=(0, 1))).astype(int) + 3, low + 1, size)
-        light = cv2.LUT(np.ascontiguousarray(view.image[low[1] : high[1], low[0] : high[0]]), LINEAR_LIGHT)
-        along = offsets.astype(np.float32)
-        x, y = (np.multiply.outer(outward[:, k].astype(np.float32), along) for k in (0, 1))
-        x += (feet[:, :1] - low[0]).astype(np.float32)
-        y += (feet[:, 1:] - low[1]).astype(np.float32)
-        sampled = cv2.remap(light, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        result[chosen] = sampled.reshape(len(chosen), rows, -1).mean(axis=1, dtype=np.float32)
-    return result
-
-
 @dataclass(frozen=True)
 class LimbEdges:
-    """Edges along N profiles: `offset` (N, M) px outwards of the best M places, `cost` (N, M) and `sigma` (N, M) px.
+    """Up to M edges along each of N profiles, the best first.
 
-    `explained` (N, M): share of what a smooth profile leaves unexplained that the edge explains, 0 to 1. Empty places
-    are NaN with explained 0.
+    Attributes:
+        offset: position (N, M) outwards [px], NaN where there is no such edge.
+        sigma: its standard deviation (N, M) [px], infinite where there is no edge.
+        explained: share (N, M), 0 to 1, of what a smooth profile leaves unexplained that the edge explains.
     """
 
     offset: FloatArray
     sigma: FloatArray
     explained: FloatArray
+
+    def shifted(self, by: FloatArray) -> LimbEdges:
+        """The edges with all offsets of a profile moved by its value (N,) [px]."""
+        return replace(self, offset=self.offset + by[:, None])
 
 
 def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
@@ -119,7 +92,7 @@ def _is_thin(half_width: float) -> bool:
     return half_width * WINDOW_OF_HALF_WIDTH < INWARD
 
 
-def _costs(
+def limb_cost(
     values: FloatArray, offsets: FloatArray, half_width: FloatArray, blur: float, trials: FloatArray
 ) -> FloatArray:
     """What `limb_basis` at each trial position leaves of the values' squares (N, T).
@@ -148,7 +121,7 @@ def _limb_spaces(width: float, blur: float, offsets: tuple[float, ...], trials: 
     return np.asarray(np.concatenate(bases, axis=1), np.float64)
 
 
-def _smooth_cost(values: FloatArray, offsets: FloatArray, half_width: FloatArray) -> FloatArray:
+def smooth_cost(values: FloatArray, offsets: FloatArray, half_width: FloatArray) -> FloatArray:
     """What a polynomial with as many coefficients as the limb model leaves (N,)."""
     order = 6 if len(values) and _is_thin(float(np.median(half_width))) else 5
     smooth = np.linalg.qr(np.vander(offsets / np.abs(offsets).max(), order))[0]
@@ -162,26 +135,24 @@ def limb_edges(
     half_width: FloatArray,
     blur: float,
     reach: float,
-    step: float = 0.1,
-    places: int = 3,
 ) -> LimbEdges:
-    """Edges within +-`reach` px of the origin of profiles `values` (N, Q) taken at `offsets` (Q,) px.
+    """Edges within +-`reach` [px] of the origin of profiles `values` (N, Q) taken at `offsets` (Q,) [px].
 
     Local minima over the position of what the limb model leaves unexplained.
     """
     light: FloatArray = np.asarray(values, np.float64)
-    trials = np.arange(-reach, reach + 0.5 * step, step, dtype=float)
-    cost = _costs(light, offsets, half_width, blur, trials)
-    return _minima(cost, _smooth_cost(light, offsets, half_width), trials, places, len(offsets))
+    trials = np.arange(-reach, reach + 0.5 * TRIAL_STEP, TRIAL_STEP, dtype=float)
+    cost = limb_cost(light, offsets, half_width, blur, trials)
+    return _minima(cost, smooth_cost(light, offsets, half_width), trials, len(offsets))
 
 
-def _minima(cost: FloatArray, plain: FloatArray, trials: FloatArray, places: int, samples: int) -> LimbEdges:
-    """The `places` deepest local minima of cost (N, T) over trials (T,), by parabolas."""
+def _minima(cost: FloatArray, plain: FloatArray, trials: FloatArray, samples: int) -> LimbEdges:
+    """The deepest local minima of cost (N, T) over trials (T,) [px], by parabolas; `plain` (N,): a smooth profile's."""
     step = trials[1] - trials[0]
     inner = cost[:, 1:-1]
     lowest = (inner <= cost[:, :-2]) & (inner < cost[:, 2:])
     ranked = np.where(lowest, inner, np.inf)
-    order = np.argsort(ranked, axis=1, kind="stable")[:, :places]
+    order = np.argsort(ranked, axis=1, kind="stable")[:, :MOST_EDGES]
     rows = np.arange(len(cost))[:, None]
     found = np.isfinite(ranked[rows, order])
     before, at, after = cost[rows, order], cost[rows, order + 1], cost[rows, order + 2]
@@ -192,92 +163,3 @@ def _minima(cost: FloatArray, plain: FloatArray, trials: FloatArray, places: int
     sigma = np.where(found, step * np.sqrt(2.0 * variance / curvature), np.inf)
     explained = np.where(found, np.clip(1.0 - at / plain[:, None], 0.0, 1.0), 0.0)
     return LimbEdges(offset, sigma, explained)
-
-
-def sideways(at: Stations) -> FloatArray:
-    """Sign (N,) of the outward displacement that a shift of the whole pipe towards side 0 causes."""
-    return np.where(at.side == 0, 1.0, -1.0)
-
-
-def outline_profiles(
-    cylinder: Cylinder,
-    views: Sequence[View],
-    others: Sequence[Cylinder],
-    basis: FloatArray,
-    view_offset: FloatArray,
-    reach: float,
-    blur: float,
-    chunk: int,
-    limit: int | None = None,
-) -> tuple[Stations, FloatArray, FloatArray]:
-    """Stations every `chunk` px on the predicted outlines, offsets (Q,) px and light (N, Q) around them.
-
-    Each profile is the mean over its chunk and starts from where the sideways `view_offset` (V,) px of its view puts
-    the outline. Stations behind one of the `others` are left out, and evenly so many that about `limit` remain.
-    """
-    at = stations(cylinder, views, basis, chunk, margin=INWARD)
-    at = at.select(visible(cylinder, others, views, at))
-    if limit is not None:
-        at = at.select(np.arange(0, len(at), max(len(at) // limit, 1)))
-    inward = INWARD
-    if len(at):
-        inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(at.half_width)))
-    outward = OUTWARD + OUTWARD_OF_BLUR * blur
-    offsets = np.arange(-inward - reach, outward + 0.25, 0.5, dtype=float)
-    shift = sideways(at) * view_offset[at.view]
-    values = profiles(views, replace(at, pixel=at.pixel + shift[:, None] * at.normal), offsets, chunk)
-    return at, offsets, np.asarray(values, float)
-
-
-def outline_edges(
-    cylinder: Cylinder,
-    views: Sequence[View],
-    others: Sequence[Cylinder],
-    basis: FloatArray,
-    view_offset: FloatArray,
-    reach: float,
-    blur: float,
-    chunk: int,
-    limit: int | None = None,
-) -> tuple[Stations, LimbEdges]:
-    """Stations as in `outline_profiles` and the edges (from the predicted outline) within `reach` px of them."""
-    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, blur, chunk, limit)
-    edges = limb_edges(values, offsets, at.half_width, blur, reach)
-    shift = sideways(at) * view_offset[at.view]
-    return at, replace(edges, offset=edges.offset + shift[:, None])
-
-
-def estimate_blur(
-    cylinder: Cylinder,
-    views: Sequence[View],
-    others: Sequence[Cylinder],
-    basis: FloatArray,
-    view_offset: FloatArray,
-    chunk: int,
-) -> float:
-    """Blur of the images [px] by which the limb model explains the outlines best.
-
-    Surfaces only soften an edge further: of the best values of all views and sides the lowest tenth counts.
-    """
-    reach = 0.8
-    at, offsets, values = outline_profiles(cylinder, views, others, basis, view_offset, reach, 1.0, chunk, 600)
-    if not len(at):
-        return SHARP
-    trials = np.arange(-reach, reach + 0.1, 0.2, dtype=float)
-    left = [_costs(values, offsets, at.half_width, float(blur), trials).min(axis=1) for blur in BLURS]
-    cost = np.log(np.stack(left) / _smooth_cost(values, offsets, at.half_width) + 1e-4)
-    clear = cost.min(axis=0) < np.log(0.4)
-    outline = 2 * at.view + at.side
-    best = []
-    for one in np.unique(outline[clear]):
-        members = clear & (outline == one)
-        if members.sum() >= 4:
-            best.append(_lowest(np.log(BLURS), cost[:, members].sum(axis=1)))
-    return float(np.exp(np.quantile(best, 0.1))) if len(best) >= 3 else SHARP
-
-
-def _lowest(x: FloatArray, cost: FloatArray) -> float:
-    """Where the parabola through the least of cost (T,) at x (T,) and its neighbours is lowest."""
-    middle = int(np.clip(np.argmin(cost), 1, len(x) - 2))
-    square, slope, _ = np.polyfit(x[middle - 1 : middle + 2], cost[middle - 1 : middle + 2], 2)
-    return float(np.clip(-0.5 * slope / square, x[0], x[-1])) if square > 0 else float(x[np.argmin(cost)])

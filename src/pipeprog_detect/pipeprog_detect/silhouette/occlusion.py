@@ -1,4 +1,4 @@
-"""What stands before what: coarse depth images of the cloud, so that a hidden stretch is no evidence against a pipe."""
+"""What hides a part of a pipe from a view (other pipes, the cloud): a hidden part is no evidence against the pipe."""
 
 from __future__ import annotations
 
@@ -12,14 +12,19 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.octree import THREADS
-from pipeprog_detect.types import View
+from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ContourSamples
+from pipeprog_detect.types import Cylinder, View
 
-# Cells across an image, and the points that fill them: some in each cell of a view that shows a seventh of them.
+# Cells across an image, and points at the most that fill them: 12 in each of the 160 x 90 cells of a view that shows a
+# seventh of the points.
 COLUMNS, MOST_POINTS = 160, 1_200_000
-# Fewer points in a cell are strays of the stereo.
+# The second nearest point of a cell counts: a single one may be a stray of the stereo.
 LEAST_POINTS = 2
-# What lies so much nearer [m] than a surface hides it; stereo spreads edges, and clamps lie upon pipes.
+# A surface is hidden by what lies nearer by more than this [m]: stereo spreads depth edges by about a centimetre, and
+# clamps stand out from the pipe that they hold by up to two.
 BEFORE = 0.03
+# Pixels by which other cylinders are grown: their poses are known to a pixel, an edge's window is two wide.
+MARGIN = 3.0
 
 
 def with_depths(views: Sequence[View], points: NDArray[np.floating]) -> list[View]:
@@ -38,8 +43,56 @@ def with_depths(views: Sequence[View], points: NDArray[np.floating]) -> list[Vie
         return list(pool.map(seen, views))
 
 
-def behind(view: View, pixel: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
-    """Which points (N,) of one surface, seen at pixel (N, 2) at depth (N,) [m], something in the cloud hides."""
+def visible(
+    samples: ContourSamples, cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]
+) -> NDArray[np.bool_]:
+    """Mask (N,) of the cylinder's samples that neither one of the `others` nor the cloud hides from their view."""
+    result = np.ones(len(samples), bool)
+    for index, view in enumerate(views):
+        chosen = np.flatnonzero(samples.view == index)
+        if len(chosen):
+            on_axis = cylinder.middle + samples.along[chosen, None] * cylinder.axis
+            depth = (on_axis - view.centre) @ view.camera_from_map[2, :3]
+            result[chosen] = ~hidden_by_cylinders(view, samples.pixel[chosen], depth, others)
+            result[chosen] &= ~hidden_by_cloud(view, samples.pixel[chosen], depth - cylinder.radius)
+    return result
+
+
+def hidden_by_cylinders(
+    view: View, pixel: FloatArray, depth: FloatArray, others: Sequence[Cylinder]
+) -> NDArray[np.bool_]:
+    """Mask (N,) of points, seen at pixel (N, 2) at depth (N,) [m], behind a cylinder grown by `MARGIN`."""
+    result = np.zeros(len(depth), bool)
+    camera, centre = view.camera, view.centre
+    rays = np.stack(
+        [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(depth))], axis=1
+    )
+    rays = rays @ view.camera_from_map[:3, :3]
+    for other in others:
+        result |= _passing(other, centre, rays, depth, MARGIN / camera.fx)
+    return result
+
+
+def _passing(
+    other: Cylinder, centre: FloatArray, rays: FloatArray, own_depth: FloatArray, margin: float
+) -> NDArray[np.bool_]:
+    """Mask (N,) of rays (N, 3) with unit depth that meet `other`, grown by `margin` x depth, before `own_depth`."""
+    axis = other.axis
+    offset = other.start - centre
+    offset_across = offset - axis * (axis @ offset)
+    rays_along = rays @ axis
+    rays_across = rays - rays_along[:, None] * axis
+    square = np.maximum(np.einsum("ij,ij->i", rays_across, rays_across), 1e-12)
+    depth = rays_across @ offset_across / square
+    miss = offset_across - depth[:, None] * rays_across
+    along = depth * rays_along - axis @ offset
+    reach = other.radius + margin * np.abs(depth)
+    near = np.einsum("ij,ij->i", miss, miss) < reach**2
+    return near & (depth > 0) & (depth < own_depth) & (along > -reach) & (along < other.length + reach)
+
+
+def hidden_by_cloud(view: View, pixel: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
+    """Mask (N,) of points of one surface, seen at pixel (N, 2) at depth (N,) [m], behind something in the cloud."""
     if view.nearest is None or not len(depth):
         return np.zeros(len(depth), bool)
     cell = view.camera.width / view.nearest.shape[1]
@@ -67,7 +120,7 @@ def _nearest(
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        if depth < np.float32(0.05):
+        if depth < np.float32(NEAR_PLANE):
             continue
         u = (lens[0] * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + lens[2]) / cell
         v = (lens[1] * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + lens[3]) / cell

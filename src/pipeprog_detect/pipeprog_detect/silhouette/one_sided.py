@@ -1,19 +1,19 @@
-"""Pipes of a rack that show one outline, the other behind their neighbour: what the cloud knows takes its place."""
+"""Pipes of a rack of which one side is hidden by a neighbour: what the cloud knows takes the place of that side."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import Stations, stations, visible
-from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.silhouette.apparent_contour import ContourSamples
+from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.types import Cylinder
 
-# An edge of texture agrees with an outline by chance in two views.
+# An edge of texture agrees with a contour by chance in two views.
 MIN_VIEWS = 3
-# Places of one outline so few beside those of the other are gaps in what hides it.
+# Samples of one side that are fewer than this share of the other's are gaps between the cylinders that hide it.
 GAPS = 0.1
 
 
@@ -21,38 +21,35 @@ GAPS = 0.1
 class SeenArc:
     """What a cloud shows of a cylinder: `arc` [rad] of its circumference, its surface known to `sigma` [m].
 
-    Stereo errs alike on all of an arc, so that `sigma` is no smaller for the number of points.
+    The error of stereo is common to all of an arc, so that `sigma` does not fall with the number of points.
     """
 
     arc: float
     sigma: float
 
 
-def lone_limb(
-    cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], basis: FloatArray, spacing: float
-) -> float | None:
-    """Where the only outline lies that the views show beside the `others`: -1 or 1 along `basis[0]`; else None."""
-    at = stations(cylinder, views, basis, spacing)
-    at = at.select(visible(cylinder, others, views, at))
-    if shows_both(at) or len(np.unique(at.view)) < MIN_VIEWS:
+def only_visible_side(cylinder: Cylinder, scene: Scene) -> float | None:
+    """-1 or 1, along the scene's `basis[0]`: the side of the only visible contour line; None where there are two."""
+    samples = scene.samples(cylinder)
+    if shows_both_sides(samples) or len(np.unique(samples.view)) < MIN_VIEWS:
         return None
-    return float(np.sign(at.jacobian[:, 0].sum()))
+    return float(np.sign(samples.jacobian[:, 0].sum()))
 
 
-def shows_both(at: Stations) -> bool:
-    """Whether visible stations lie on both outlines, more of them than gaps in what hides one let through."""
-    count = np.bincount(at.side, minlength=2)
+def shows_both_sides(samples: ContourSamples) -> bool:
+    """Whether visible samples lie on both sides, more of them than gaps in what hides one let through."""
+    count = np.bincount(samples.side, minlength=2)
     return bool(count.min() > GAPS * count.max())
 
 
-def precision(seen: SeenArc, limb: float) -> FloatArray:
-    """(5, 5) precision [1/m^2] that an arc from the `limb` (-1 or 1) towards the viewer gives `outline.moved`'s step.
+def arc_precision(seen: SeenArc, side: float) -> FloatArray:
+    """(5, 5) precision [1/m^2] that an arc from `side` (-1 or 1) towards the viewer gives the step of `Scene.moved`.
 
     Where the surface is seen it is known to sigma; with half of the arc as a, the radius follows from its sagitta, to
     sigma / (1 - cos a), and where the axis lies across its middle from its ends, to sigma / sin a.
     """
     half = 0.5 * min(seen.arc, np.pi)
-    middle = np.array([limb * np.cos(half), -np.sin(half)])  # of the arc, from the axis; the viewer is at -basis[1]
+    middle = np.array([side * np.cos(half), -np.sin(half)])  # of the arc, from the axis; the viewer is at -basis[1]
     across = np.array([-middle[1], middle[0]])
     rows = np.zeros((5, 5))
     for number, end in enumerate((slice(0, 2), slice(2, 4))):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import inside
+from pipeprog_detect.silhouette.apparent_contour import in_image
 from pipeprog_detect.types import Cylinder, View
 
 # The cloud beside a thin pipe is looked at as far as so many of its widths.
@@ -23,7 +23,7 @@ FOREMOST = 0.25
 
 def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
     """Mean projection centre (3,) of the views that show the cylinder's middle, None where none does."""
-    centres = [view.centre for view in views if inside(view, cylinder.middle[None])[0]]
+    centres = [view.centre for view in views if in_image(view, cylinder.middle[None])[0]]
     return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
 
 
@@ -42,7 +42,7 @@ def covers(one: Cylinder, other: Cylinder, centre: FloatArray, radii: float) -> 
     return in_front and float(np.abs(aside).max()) < radii * one.radius and gap < 0.3
 
 
-def spanning(one: Cylinder, other: Cylinder, centre: FloatArray) -> Cylinder:
+def extended_to(one: Cylinder, other: Cylinder, centre: FloatArray) -> Cylinder:
     """The first cylinder made as long as both, seen from `centre`."""
     axis, towards, _ = _sight(one, centre)
     ends = np.stack([other.start, other.end]) - centre

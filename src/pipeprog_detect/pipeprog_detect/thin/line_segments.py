@@ -1,4 +1,4 @@
-"""Ribbons in one keyframe: two nearly parallel lines no farther apart than a thin pipe's outlines."""
+"""Segment pairs in one keyframe: two nearly parallel lines no farther apart than the sides of a thin pipe."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from pipeprog_camera.arrays import FloatArray
 
 # Segments shorter than this [px] are texture more often than not.
 SHORTEST = 10.0
-# Segments of one edge: this far off its line [px], turned by so much, across gaps up to a clamp or a blot [px].
+# Segments belong to one edge if they are off its line by less than this [px], turned by less than this [rad] (1.2 px
+# over half of `LEAST_SEEN` are 6 deg), and apart by less than a clamp or a stain hides [px].
 OFF_LINE, TURNED, GAP = 1.2, np.radians(4.0), 40.0
 # Seen parts of an edge [px] that make a line of it, and the share of its extent that they must cover.
 LEAST_SEEN, LEAST_SHARE = 24.0, 0.4
-# The two outlines of a pipe run together by less than its width over its length, and by little more beside noise.
+# The two sides of a pipe converge by less than its width over its length; with noise by less than this [rad].
 TAPER = np.radians(3.0)
 
 
 @dataclass(frozen=True)
-class Ribbons:
+class SegmentPairs:
     """N pairs of lines in one image: `ends` (N, 2, 2) of their centre lines [px] and `width` (N, 2) there [px]."""
 
     ends: FloatArray
@@ -31,9 +32,9 @@ class Ribbons:
     def __len__(self) -> int:
         return len(self.ends)
 
-    def select(self, keep: NDArray[np.bool_]) -> Ribbons:
+    def select(self, keep: NDArray[np.bool_]) -> SegmentPairs:
         """Those that a mask (N,) names."""
-        return Ribbons(self.ends[keep], self.width[keep])
+        return SegmentPairs(self.ends[keep], self.width[keep])
 
 
 def straight_edges(image: NDArray[np.uint8]) -> FloatArray:
@@ -50,7 +51,7 @@ def straight_edges(image: NDArray[np.uint8]) -> FloatArray:
     return _joined(np.ascontiguousarray(segments[order[length[order] >= SHORTEST]]))
 
 
-def ribbons(edges: FloatArray, narrowest: float, widest: float) -> Ribbons:
+def segment_pairs(edges: FloatArray, narrowest: float, widest: float) -> SegmentPairs:
     """Pairs of edges (N, 2, 2) that face each other at a distance from `narrowest` to `widest` [px].
 
     Light may come from any side: neither edge need be the darker one.
@@ -75,7 +76,7 @@ def ribbons(edges: FloatArray, narrowest: float, widest: float) -> Ribbons:
                 continue
             ends.append(edges[one, 0] + at[:, None] * along[one] + 0.5 * width[:, None] * across)
             widths.append(np.abs(width))
-    return Ribbons(np.array(ends, np.float64).reshape(-1, 2, 2), np.array(widths, np.float64).reshape(-1, 2))
+    return SegmentPairs(np.array(ends, np.float64).reshape(-1, 2, 2), np.array(widths, np.float64).reshape(-1, 2))
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""Thin pipes that the cloud lost: ribbons in the keyframes that agree, over the views, on one cylinder in space."""
+"""Thin pipes by triangulation: segment pairs in the keyframes that agree, over the views, on one cylinder in space."""
 
 from __future__ import annotations
 
@@ -10,22 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import inside, project
-from pipeprog_detect.thin.depth_from_cloud import LAID_REACH, RELIEF_REACH, by_bin, covers, laid, robust_line, spanning
-from pipeprog_detect.thin.line_segments import Ribbons, ribbons, straight_edges
+from pipeprog_detect.silhouette.apparent_contour import in_image, project
+from pipeprog_detect.thin.depth_from_cloud import (
+    LAID_REACH,
+    RELIEF_REACH,
+    by_bin,
+    covers,
+    extended_to,
+    laid,
+    robust_line,
+)
+from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
 
 # Lines are sought in views that differ by so much of the distance to what they see, and in no more than so many.
 STEP, MOST_VIEWS = 0.12, 120
 # Half of a thin pipe's width [px] that suffices to see its two outlines: larger images are reduced.
 ENOUGH = 4.5
-# Standard deviations of a ribbon's centre line and width [px], shading and shadows beside the pipe included, ...
+# Standard deviations of a segment pair's centre line and width [px], shading and shadows beside the pipe included, ...
 CENTRE_SIGMA, WIDTH_SIGMA = 1.0, 1.2
 # ... and what the worst accepted sum of their squares is: two degrees of freedom, one in a thousand.
 WORST = 13.8
-# The next views that a ribbon is sought in first, and the views in all that must show a pipe.
+# The next views that a segment pair is sought in first, and the views in all that must show a pipe.
 PARTNERS, MIN_VIEWS, MIN_SHARE = 3, 4, 0.25
-# Common stretch of two ribbons of one pipe, of the shorter one.
+# Common stretch of two segment pairs of one pipe, of the shorter one.
 OVERLAP = 0.3
 # Standard deviation of a hypothesis's depth, in radii of the pipe.
 DEPTH_SIGMA = 1.0
@@ -36,14 +44,14 @@ MOST_HYPOTHESES = 4000
 
 
 @dataclass(frozen=True)
-class _Eye:
-    """One view at the size at which lines were sought, its ribbons, and the depths [m] of what it sees.
+class _PairView:
+    """One view at the size at which lines were sought, its segment pairs, and the depths [m] of what it sees.
 
-    `before` (N, 2): depth [m] of the cloud at the ribbons' ends, NaN where the cloud does not show them.
+    `before` (N, 2): depth [m] of the cloud at the segment pairs' ends, NaN where the cloud does not show them.
     """
 
     view: View
-    ribbons: Ribbons
+    pairs: SegmentPairs
     depth: tuple[float, float]
     before: FloatArray
 
@@ -71,19 +79,26 @@ def propose(
 ) -> list[Cylinder]:
     """Up to `limit` cylinders of the given radii [m] that the lines of several views agree on, best seen first.
 
-    `points` (N, 3) of the cloud bound the depths of each view. A ribbon of a view and a radius make a cylinder: its
-    depth follows from the ribbon's width, and from the centre line of another view's ribbon where the camera has moved
-    across the pipe. Ribbons within the silhouette of a `known` cylinder are left out. An outline
-    with a shadow's edge or a highlight beside it makes a rival of the pipe: both are proposed. `edges` remembers the
-    images' edges by stamp and width.
+    A segment pair of a view and a radius make a cylinder: its depth follows from the pair's width, and from the centre
+    line of another view's pair where the camera has moved across the pipe. One side of a pipe with a shadow's edge or a
+    highlight beside it makes a rival of the pipe: both are proposed.
+
+    Args:
+        views: the keyframes.
+        points: of the cloud (N, 3); they bound the depths of each view.
+        radii: of thin pipes [m].
+        known: cylinders in whose silhouettes no segment pairs are sought.
+        limit: largest number of cylinders.
+        edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
-    lines = {} if edges is None else edges
-    eyes = [eye for eye in (_eye(view, points, radii, known, lines) for view in _few(views, points)) if eye is not None]
-    parts = [_raised(eye, radius) for eye in eyes for radius in radii]
+    edges = {} if edges is None else edges
+    seen = (_pair_view(view, points, radii, known, edges) for view in _apart(views, points))
+    sights = [sight for sight in seen if sight is not None]
+    parts = [_at_cloud_depth(sight, radius) for sight in sights for radius in radii]
     parts += [
-        _pairs(eye, other, radius)
-        for number, eye in enumerate(eyes)
-        for other in eyes[number + 1 : number + 1 + PARTNERS]
+        _triangulated(sight, other, radius)
+        for number, sight in enumerate(sights)
+        for other in sights[number + 1 : number + 1 + PARTNERS]
         for radius in radii
     ]
     parts = [part for part in parts if len(part.radius)]
@@ -93,12 +108,12 @@ def propose(
     axes = _Axes(*(np.concatenate(column) for column in columns))
     axes = axes.select(np.arange(0, len(axes.radius), -(-len(axes.radius) // MOST_HYPOTHESES)))
     for _ in range(2):
-        matched = [_matches(axes, eye) for eye in eyes]
-        axes = _adjusted(axes, eyes, matched)
-    matched = [_matches(axes, eye) for eye in eyes]
-    sees = np.stack([_sees(axes, eye) for eye in eyes])
+        matched = [_matches(axes, sight) for sight in sights]
+        axes = _adjusted(axes, sights, matched)
+    matched = [_matches(axes, sight) for sight in sights]
+    sees = np.stack([_in_view(axes, sight) for sight in sights])
     seen = sees.sum(axis=0)
-    count = np.sum([ribbon >= 0 for ribbon in matched], axis=0)
+    count = np.sum([pair >= 0 for pair in matched], axis=0)
     found: list[Cylinder] = []
     centres: list[FloatArray] = []
     for best in np.argsort(-count, kind="stable"):
@@ -107,25 +122,25 @@ def propose(
         cylinder = Cylinder(axes.ends[best, 0], axes.ends[best, 1], float(axes.radius[best]))
         covering = [k for k in range(len(found)) if covers(found[k], cylinder, centres[k], SAME_LINE)]
         if covering:
-            found[covering[0]] = spanning(found[covering[0]], cylinder, centres[covering[0]])
+            found[covering[0]] = extended_to(found[covering[0]], cylinder, centres[covering[0]])
         elif len(found) < limit:
             found.append(cylinder)
-            centres.append(np.mean([eyes[k].view.centre for k in np.flatnonzero(sees[:, best])], axis=0))
+            centres.append(np.mean([sights[k].view.centre for k in np.flatnonzero(sees[:, best])], axis=0))
     if not found:
         return []
     found = [laid(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)]
     radius = np.array([one.radius for one in found])
     axes = _Axes(np.stack([[one.start, one.end] for one in found]), radius, DEPTH_SIGMA * radius)
-    axes = _adjusted(axes, eyes, [_matches(axes, eye) for eye in eyes])
+    axes = _adjusted(axes, sights, [_matches(axes, sight) for sight in sights])
     return [Cylinder(ends[0], ends[1], float(radius)) for ends, radius in zip(axes.ends, axes.radius, strict=True)]
 
 
-def _few(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
+def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
     """Views of the cloud's points far enough from the last one to tell more than it did."""
     chosen: list[View] = []
     sparse = points[:: max(len(points) // 5000, 1)]
     for view in views:
-        depth = _seen_points(view, sparse)[1]
+        depth = _points_in(view, sparse)[1]
         if len(depth) and (
             not chosen or np.linalg.norm(view.centre - chosen[-1].centre) > STEP * float(np.median(depth))
         ):
@@ -133,14 +148,14 @@ def _few(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
     return chosen[:: -(-len(chosen) // MOST_VIEWS)] if chosen else []
 
 
-def _eye(
+def _pair_view(
     view: View,
     points: NDArray[np.float32],
     radii: Sequence[float],
     known: Sequence[Cylinder],
     lines: dict[tuple[int, int], FloatArray],
-) -> _Eye | None:
-    pixel, depth = _seen_points(view, points)
+) -> _PairView | None:
+    pixel, depth = _points_in(view, points)
     if len(depth) < 100:
         return None
     near, middle, far = np.percentile(depth[:: max(len(depth) // 5000, 1)], [1, 50, 99])
@@ -156,23 +171,23 @@ def _eye(
     key = (view.stamp, view.camera.width)
     if key not in lines:
         lines[key] = straight_edges(view.image)
-    found = ribbons(lines[key], max(narrowest, 2.0), widest)
+    found = segment_pairs(lines[key], max(narrowest, 2.0), widest)
     within = np.zeros(len(found), bool)
     for cylinder in known:
-        within |= _covered(found, cylinder, view)
+        within |= _within_silhouette(found, cylinder, view)
     found = found.select(~within)
-    before, flat = _relief(found, pixel, depth, min(radii))
-    return _Eye(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
+    before, flat = _cloud_depths(found, pixel, depth, min(radii))
+    return _PairView(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
 
 
-def _relief(
-    found: Ribbons, pixel: NDArray[np.float32], depth: NDArray[np.float32], radius: float
+def _cloud_depths(
+    found: SegmentPairs, pixel: NDArray[np.float32], depth: NDArray[np.float32], radius: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Depth [m] of the cloud at the ends (N, 2) of ribbons that stand out from it, and which lie flat in it (N,).
+    """Depth [m] of the cloud at the ends (N, 2) of segment pairs that stand out from it, and which lie flat in it (N,).
 
     A pipe that touches a wall stands out from it by its diameter, a painted strip, a joint or a shadow does not.
-    Stereo spreads a thin pipe in depth, towards the wall: of the points within a ribbon the nearer count. Where a
-    ribbon holds too few, depth is NaN.
+    Stereo spreads a thin pipe in depth, towards the wall: of the points within a segment pair the nearer count. Where a
+    segment pair holds too few, depth is NaN.
     """
     before = np.full((len(found), 2), np.nan)
     flat = np.zeros(len(found), bool)
@@ -211,18 +226,18 @@ def _relief(
     return before, flat
 
 
-def _raised(eye: _Eye, radius: float) -> _Axes:
-    """Axes of ribbons that stand out from the cloud and are as wide as a pipe of `radius` [m] would be there."""
-    depth = eye.before + 0.5 * radius
-    width = 2.0 * eye.view.camera.fx * radius / depth
-    fits = np.isfinite(depth).all(axis=1) & (np.abs(width - eye.ribbons.width).max(axis=1) < 2.5 * WIDTH_SIGMA)
-    in_eye = _rays(eye)[fits] * depth[fits][..., None]
-    pose = np.linalg.inv(eye.view.camera_from_map)
-    count = len(in_eye)
-    return _Axes(in_eye @ pose[:3, :3].T + pose[:3, 3], np.full(count, radius), np.full(count, DEPTH_SIGMA * radius))
+def _at_cloud_depth(sight: _PairView, radius: float) -> _Axes:
+    """Axes of segment pairs that stand out from the cloud and are as wide as a pipe of `radius` [m] would be there."""
+    depth = sight.before + 0.5 * radius
+    width = 2.0 * sight.view.camera.fx * radius / depth
+    fits = np.isfinite(depth).all(axis=1) & (np.abs(width - sight.pairs.width).max(axis=1) < 2.5 * WIDTH_SIGMA)
+    in_camera = _rays(sight)[fits] * depth[fits][..., None]
+    pose = np.linalg.inv(sight.view.camera_from_map)
+    count = len(in_camera)
+    return _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(count, radius), np.full(count, DEPTH_SIGMA * radius))
 
 
-def _seen_points(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _points_in(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pixels (M, 2) and depths (M,) [m] of those points (N, 3) that lie within the view."""
     pose = view.camera_from_map.astype(np.float32)
     camera = view.camera
@@ -235,8 +250,8 @@ def _seen_points(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.fl
     return np.stack([x[inside], y[inside]], axis=1), depth[inside]
 
 
-def _covered(found: Ribbons, cylinder: Cylinder, view: View) -> NDArray[np.bool_]:
-    """Ribbons (N,) whose both ends lie within the silhouette of a cylinder."""
+def _within_silhouette(found: SegmentPairs, cylinder: Cylinder, view: View) -> NDArray[np.bool_]:
+    """Segment pairs (N,) whose both ends lie within the silhouette of a cylinder."""
     ends, depth = project(view, np.stack([cylinder.start, cylinder.end]))
     if (depth < 0.05).any():
         return np.zeros(len(found), bool)
@@ -250,76 +265,76 @@ def _covered(found: Ribbons, cylinder: Cylinder, view: View) -> NDArray[np.bool_
     return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
 
 
-def _rays(eye: _Eye) -> FloatArray:
-    """Directions (N, 2, 3) with unit depth, in the camera's frame, of the ribbons' ends."""
-    camera = eye.view.camera
-    ends = eye.ribbons.ends
+def _rays(sight: _PairView) -> FloatArray:
+    """Directions (N, 2, 3) with unit depth, in the camera's frame, of the segment pairs' ends."""
+    camera = sight.view.camera
+    ends = sight.pairs.ends
     x = (ends[..., 0] - camera.cx) / camera.fx
     y = (ends[..., 1] - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
-def _centre_lines(found: Ribbons) -> FloatArray:
-    """Lines (N, 3) through the ribbons' ends with unit normals: line . (x, y, 1) is the distance [px]."""
+def _centre_lines(found: SegmentPairs) -> FloatArray:
+    """Lines (N, 3) through the segment pairs' ends with unit normals: line . (x, y, 1) is the distance [px]."""
     along = found.ends[:, 1] - found.ends[:, 0]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
     return np.concatenate([normal, -np.einsum("ij,ij->i", normal, found.ends[:, 0])[:, None]], axis=1)
 
 
-def _lost(eye: _Eye) -> _Eye:
-    """The view with those ribbons alone that the cloud does not show."""
-    return replace(eye, ribbons=eye.ribbons.select(np.asarray(np.isnan(eye.before).any(axis=1), bool)))
+def _without_depth(sight: _PairView) -> _PairView:
+    """The view with those segment pairs alone that the cloud does not show."""
+    return replace(sight, pairs=sight.pairs.select(np.asarray(np.isnan(sight.before).any(axis=1), bool)))
 
 
-def _pairs(eye: _Eye, other: _Eye, radius: float) -> _Axes:
-    """Axes that a ribbon of one view and one of another make with a radius [m].
+def _triangulated(sight: _PairView, other: _PairView, radius: float) -> _Axes:
+    """Axes that a segment pair of one view and one of another make with a radius [m].
 
     The inverse depth of each end of the first follows by linear least squares from both widths and from the distance
     of the projected end from the other centre line.
     """
     none = _Axes(np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
-    if not len(eye.ribbons) or not len(other.ribbons):
+    if not len(sight.pairs) or not len(other.pairs):
         return none
-    eye, other = _lost(eye), _lost(other)  # what the cloud shows needs no second view
-    if not len(eye.ribbons) or not len(other.ribbons):
+    sight, other = _without_depth(sight), _without_depth(other)  # what the cloud shows needs no second view
+    if not len(sight.pairs) or not len(other.pairs):
         return none
-    focal, rays = eye.view.camera.fx, _rays(eye)
-    other_from_eye = other.view.camera_from_map @ np.linalg.inv(eye.view.camera_from_map)
+    focal, rays = sight.view.camera.fx, _rays(sight)
+    other_from_sight = other.view.camera_from_map @ np.linalg.inv(sight.view.camera_from_map)
     matrix = other.view.camera.matrix
-    still = rays @ (matrix @ other_from_eye[:3, :3]).T
-    shift = matrix @ other_from_eye[:3, 3]
-    width = eye.ribbons.width
+    still = rays @ (matrix @ other_from_sight[:3, :3]).T
+    shift = matrix @ other_from_sight[:3, 3]
+    width = sight.pairs.width
     first = width / (2.0 * focal * radius)
     depth = still[..., 2] + first * shift[2]
     if not (depth > 0.1).any():
         return none
     depth = np.maximum(depth, 0.1)
-    line = _centre_lines(other.ribbons)
+    line = _centre_lines(other.pairs)
     slope = (line @ shift)[None, None] / (depth[..., None] * CENTRE_SIGMA)
     level = -np.einsum("pek,qk->peq", still, line) / (depth[..., None] * CENTRE_SIGMA)
     gauge = 2.0 * focal * radius / WIDTH_SIGMA
     own = width / WIDTH_SIGMA
     gauge_there = (gauge / depth)[..., None]
-    there = other.ribbons.width.mean(axis=1) / WIDTH_SIGMA
+    there = other.pairs.width.mean(axis=1) / WIDTH_SIGMA
     inverse = (slope * level + (gauge * own)[..., None] + gauge_there * there) / (slope**2 + gauge**2 + gauge_there**2)
     left = (
         (slope * inverse - level) ** 2 + (gauge * inverse - own[..., None]) ** 2 + (gauge_there * inverse - there) ** 2
     )
-    near, far = eye.depth
+    near, far = sight.depth
     good = ((left < WORST) & (inverse > 1.0 / far) & (inverse < 1.0 / near)).all(axis=1)
     one, two = np.nonzero(good)
     if not len(one):
         return none
-    in_eye = rays[one] / inverse[one, :, two][..., None]
-    pose = np.linalg.inv(eye.view.camera_from_map)
-    axes = _Axes(in_eye @ pose[:3, :3].T + pose[:3, 3], np.full(len(one), radius), np.full(len(one), LAID_REACH))
+    in_camera = rays[one] / inverse[one, :, two][..., None]
+    pose = np.linalg.inv(sight.view.camera_from_map)
+    axes = _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(len(one), radius), np.full(len(one), LAID_REACH))
     ends, _ = _projected(axes, other)
-    return axes.select(_overlap(ends, other.ribbons.ends[two]) > OVERLAP)
+    return axes.select(_overlap(ends, other.pairs.ends[two]) > OVERLAP)
 
 
-def _projected(axes: _Axes, eye: _Eye) -> tuple[FloatArray, FloatArray]:
+def _projected(axes: _Axes, sight: _PairView) -> tuple[FloatArray, FloatArray]:
     """Pixels (H, 2, 2) and depths (H, 2) of the axes' ends."""
-    pixel, depth = project(eye.view, axes.ends.reshape(-1, 3))
+    pixel, depth = project(sight.view, axes.ends.reshape(-1, 3))
     return pixel.reshape(-1, 2, 2), depth.reshape(-1, 2)
 
 
@@ -334,38 +349,38 @@ def _overlap(ends: FloatArray, others: FloatArray) -> FloatArray:
     return np.asarray((high - low) / (shorter + 1e-9))
 
 
-def _sees(axes: _Axes, eye: _Eye) -> NDArray[np.bool_]:
+def _in_view(axes: _Axes, sight: _PairView) -> NDArray[np.bool_]:
     """Which axes (H,) have their middle inside the view."""
-    return inside(eye.view, axes.ends.mean(axis=1))
+    return in_image(sight.view, axes.ends.mean(axis=1))
 
 
-def _matches(axes: _Axes, eye: _Eye) -> NDArray[np.int64]:
-    """The ribbon (H,) of the view that fits each axis best, -1 where none does."""
+def _matches(axes: _Axes, sight: _PairView) -> NDArray[np.int64]:
+    """Index (H,) of the segment pair of the view that fits each axis best, -1 where none does."""
     none = np.full(len(axes.radius), -1)
-    if not len(eye.ribbons):
+    if not len(sight.pairs):
         return none
-    ends, depth = _projected(axes, eye)
+    ends, depth = _projected(axes, sight)
     front = (depth > 0.05).all(axis=1)
     along = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(along, axis=1) + 1e-9
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
-    offset = eye.ribbons.ends[None] - ends[:, None, :1]
+    offset = sight.pairs.ends[None] - ends[:, None, :1]
     aside = np.einsum("hqek,hk->hqe", offset, normal)
     place = np.einsum("hqek,hk->hqe", offset, along) / (length**2)[:, None, None]
     inverse = 1.0 / depth[:, 0, None, None] + np.clip(place, 0.0, 1.0) * np.diff(1.0 / depth, axis=1)[:, None]
-    width = 2.0 * eye.view.camera.fx * axes.radius[:, None, None] * inverse
-    left = (aside / (2.0 * CENTRE_SIGMA)) ** 2 + ((width - eye.ribbons.width[None]) / WIDTH_SIGMA) ** 2
+    width = 2.0 * sight.view.camera.fx * axes.radius[:, None, None] * inverse
+    left = (aside / (2.0 * CENTRE_SIGMA)) ** 2 + ((width - sight.pairs.width[None]) / WIDTH_SIGMA) ** 2
     worst: FloatArray = left.max(axis=2)
-    common = _overlap(np.broadcast_to(ends[:, None], offset.shape), np.broadcast_to(eye.ribbons.ends, offset.shape))
+    common = _overlap(np.broadcast_to(ends[:, None], offset.shape), np.broadcast_to(sight.pairs.ends, offset.shape))
     worst = np.where(np.asarray(front)[:, None] & (common > OVERLAP), worst, np.inf)
     best = np.argmin(worst, axis=1)
     return np.where(worst[np.arange(len(best)), best] < WORST, best, none)
 
 
-def _adjusted(axes: _Axes, eyes: Sequence[_Eye], matched: Sequence[NDArray[np.int64]]) -> _Axes:
-    """The axes after a least-squares step on the ribbons that match, and as long as what these show.
+def _adjusted(axes: _Axes, sights: Sequence[_PairView], matched: Sequence[NDArray[np.int64]]) -> _Axes:
+    """The axes after a least-squares step on the segment pairs that match, and as long as what these show.
 
-    Each end moves across the axis by (2,); the ribbons' centre lines and widths, at both of the ribbon's ends, are
+    Each end moves across the axis by (2,); the segment pairs' centre lines and widths, at both of the pair's ends, are
     the observations; the depth that a hypothesis came with is the prior.
     """
     count = len(axes.radius)
@@ -373,8 +388,8 @@ def _adjusted(axes: _Axes, eyes: Sequence[_Eye], matched: Sequence[NDArray[np.in
     length = np.linalg.norm(along, axis=1)
     along = along / length[:, None]
     middle = axes.ends.mean(axis=1)
-    weight = np.stack([_sees(axes, eye) for eye in eyes]).astype(float) + 1e-6
-    towards = middle - weight.T @ np.stack([eye.view.centre for eye in eyes]) / weight.sum(axis=0)[:, None]
+    weight = np.stack([_in_view(axes, sight) for sight in sights]).astype(float) + 1e-6
+    towards = middle - weight.T @ np.stack([sight.view.centre for sight in sights]) / weight.sum(axis=0)[:, None]
     depth = towards - along * np.einsum("ij,ij->i", along, towards)[:, None]
     depth = depth / (np.linalg.norm(depth, axis=1)[:, None] + 1e-12)
     basis = np.stack([np.cross(along, depth), depth], axis=1)
@@ -382,25 +397,25 @@ def _adjusted(axes: _Axes, eyes: Sequence[_Eye], matched: Sequence[NDArray[np.in
     right = np.zeros((count, 4))
     low: FloatArray = np.full(count, np.inf)
     high: FloatArray = np.full(count, -np.inf)
-    for eye, ribbon in zip(eyes, matched, strict=True):
-        rows = np.flatnonzero(ribbon >= 0)
+    for sight, pair in zip(sights, matched, strict=True):
+        rows = np.flatnonzero(pair >= 0)
         if not len(rows):
             continue
-        chosen, camera = ribbon[rows], eye.view.camera
-        line = _centre_lines(eye.ribbons)[chosen]
-        rotation = eye.view.camera_from_map[:3, :3]
-        pixel, far = _projected(axes.select(rows), eye)
+        chosen, camera = pair[rows], sight.view.camera
+        line = _centre_lines(sight.pairs)[chosen]
+        rotation = sight.view.camera_from_map[:3, :3]
+        pixel, far = _projected(axes.select(rows), sight)
         image_along = pixel[:, 1] - pixel[:, 0]
         square = (image_along**2).sum(axis=1)
         for end in (0, 1):
-            # Where the ribbon's end falls on the axis: perspective makes the share of the length of that in the image.
-            share = np.einsum("ij,ij->i", eye.ribbons.ends[chosen, end] - pixel[:, 0], image_along) / square
+            # Where the pair's end falls on the axis: perspective makes the share of the length of that in the image.
+            share = np.einsum("ij,ij->i", sight.pairs.ends[chosen, end] - pixel[:, 0], image_along) / square
             share = share * far[:, 0] / (far[:, 1] + share * (far[:, 0] - far[:, 1]))
             share = np.clip(share, -0.5, 1.5)
             low[rows] = np.minimum(low[rows], share)
             high[rows] = np.maximum(high[rows], share)
             point = axes.ends[rows, 0] + (share * length[rows])[:, None] * along[rows]
-            seen, distance = project(eye.view, point)
+            seen, distance = project(sight.view, point)
             sideways = line[:, :2] @ np.diag([camera.fx, camera.fy])
             ray = np.stack([(seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy], axis=1)
             gradient = np.concatenate([sideways, -(sideways * ray).sum(axis=1)[:, None]], axis=1) / distance[:, None]
@@ -409,7 +424,7 @@ def _adjusted(axes: _Axes, eyes: Sequence[_Eye], matched: Sequence[NDArray[np.in
             _accumulate(normal, right, rows, share, moves, residual, CENTRE_SIGMA)
             width = 2.0 * camera.fx * axes.radius[rows] / distance
             moves = -(width / distance)[:, None] * np.einsum("l,ijl->ij", rotation[2], basis[rows])
-            _accumulate(normal, right, rows, share, moves, eye.ribbons.width[chosen, end] - width, WIDTH_SIGMA)
+            _accumulate(normal, right, rows, share, moves, sight.pairs.width[chosen, end] - width, WIDTH_SIGMA)
     step = np.linalg.solve(normal, right[..., None])[..., 0].reshape(count, 2, 2)
     shown = low < high
     low, high = np.where(shown, low, 0.0).astype(float), np.where(shown, high, 1.0).astype(float)

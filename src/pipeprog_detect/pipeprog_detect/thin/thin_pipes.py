@@ -1,4 +1,4 @@
-"""Thin pipes of which the keyframes show lines and the cloud too little: proposed, laid at their depth, measured."""
+"""Thin pipes of which the cloud shows too little: proposed by lines in the keyframes, put at their depth, measured."""
 
 from __future__ import annotations
 
@@ -10,84 +10,91 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
-from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.apparent_contour import viewing_direction
 from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, refine
-from pipeprog_detect.silhouette.edge_support import outline_support
+from pipeprog_detect.silhouette.edge_support import contour_support
 from pipeprog_detect.thin.depth_from_cloud import covers, laid, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.measured_pipe import Measured, is_known, is_stub
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 
-# Lines are followed up for so many pipes at most, beside so many of the cloud's points.
-MOST_LOST, MOST_POINTS = 40, 600_000
-# Without points of the cloud the outlines must be the better seen, and each of the two for itself at least half as
-# well: the edge of a duct, whose faces differ in brightness, is one outline, with texture for the other.
+# Proposals that are measured, and points of the cloud that bound their depths: a computing budget. More proposals than
+# a site has thin pipes cost time only; the points are ten for each cell of a view's coarse depth image.
+MOST_PROPOSED, MOST_POINTS = 40, 600_000
+# Without support by the cloud, this support of the contour is required, and half of it on each side separately: the
+# edge of a duct, whose faces differ in brightness, is one side, with texture for the other.
 LINES_CONVINCING = 0.6
-# What the distance of a pipe found by its lines is known to [m]: its width tells a twentieth, the cloud more.
+# Standard deviation of the distance of a pipe found by its lines [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
-# Pipes that run within so much of one direction are laid parallel, to so much; two may be so by chance.
+# Pipes are installed parallel, to a standard deviation of 0.3 deg: at least three within 5 deg of one direction tell it
+# (two may be so by chance).
 NEARLY_PARALLEL, PARALLEL_SIGMA, LEAST_PARALLEL = np.radians(5.0), np.radians(0.3), 3
-# The axes of pipes side by side are so many radii apart.
+# The axes of pipes side by side are at least two radii apart.
 TOUCHING = 2.0
-# A strip's edges stay where they are, a cylinder's outlines do not: halfway between, by so many standard deviations.
+# Flatness is 0 for a cylinder and 1 for a strip: one that exceeds the middle by two standard deviations is a strip.
 FLAT, SURELY = 0.5, 2.0
 
 
-def find_lost(
+def find_thin_pipes(
     points: NDArray[np.floating],
     thickest: float,
-    found: Sequence[Measured],
+    found: Sequence[MeasuredPipe],
     views: Sequence[View],
     boq: BillOfQuantities,
-    config: ContourConfig,
     edges: dict[tuple[int, int], FloatArray],
-) -> list[Measured]:
-    """Pipes up to `thickest` [m], beside those found, of which the views show lines and the cloud (N, 3) too little.
+) -> list[MeasuredPipe]:
+    """Pipes of radius up to `thickest` [m], beside those found, that the views show and the cloud hardly does.
 
-    They must have a planned size and most of their outlines, and these must move against each other from view to
-    view as a cylinder's do, where the views differ enough to tell. `edges`: as `ribbons.propose` keeps them.
+    They must have a planned radius and support along their contours, whose sides must move against each other from view
+    to view as a cylinder's do, where the views differ enough to tell.
+
+    Args:
+        points: of the cloud (N, 3).
+        thickest: largest radius [m].
+        found: the pipes of the cloud.
+        views: the keyframes.
+        boq: the bill of quantities.
+        edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
-    thin = [planned.outer_radius for planned in boq.classes if planned.outer_radius < thickest]
-    if not views or not thin:
+    radii = [planned.outer_radius for planned in boq.classes if planned.outer_radius < thickest]
+    if not views or not radii:
         return []
-    lines = _Lines(views, points.astype(np.float32), thin, boq, config)
+    lines = _LineFitter(views, points.astype(np.float32), radii, boq)
     some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
-    lost: list[Measured] = []
-    for proposed in propose(views, some, thin, known, MOST_LOST, edges):
-        if is_known(proposed, known) or _is_rival(proposed, lost, views):
+    thin: list[MeasuredPipe] = []
+    for proposed in propose(views, some, radii, known, MOST_PROPOSED, edges):
+        if is_known(proposed, known) or _is_rival(proposed, thin, views):
             continue
         fit = lines.measure(proposed, known, follow=False)
         if fit is not None:
             fit = lines.follow(fit, proposed.radius, known)
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known):
             continue
-        lost.append(Measured(_seen(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
+        thin.append(MeasuredPipe(_as_candidate(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
         known.append(fit.cylinder)
-    return lost
+    return thin
 
 
-def _is_rival(proposed: Cylinder, lost: Sequence[Measured], views: Sequence[View]) -> bool:
-    """Whether the views show it where they show one of the lost pipes: two cannot both be there."""
+def _is_rival(proposed: Cylinder, thin: Sequence[MeasuredPipe], views: Sequence[View]) -> bool:
+    """Whether the views show it where they show one of the thin pipes: only one can be there."""
     centre = mean_centre(proposed, views)
-    return centre is not None and any(covers(each.cylinder, proposed, centre, TOUCHING) for each in lost)
+    return centre is not None and any(covers(each.cylinder, proposed, centre, TOUCHING) for each in thin)
 
 
 @dataclass(frozen=True)
-class _Lines:
-    """The views, the cloud's points (N, 3), the radii [m] of thin pipes, and what makes one."""
+class _LineFitter:
+    """Fits proposals in the views; with the cloud's points (N, 3) and the radii [m] of thin pipes."""
 
     views: Sequence[View]
     points: NDArray[np.float32]
     radii: Sequence[float]
     boq: BillOfQuantities
-    config: ContourConfig
 
     def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
-        """The whole of a pipe of the given radius of which a piece was found.
+        """The whole of a pipe of the given radius [m] of which a piece was found.
 
         Its depth, which lines seen from one height leave open, is that of the cloud's points before the wall.
         """
@@ -106,14 +113,14 @@ class _Lines:
         slope_sigma: float = np.inf,
         follow: bool = True,
     ) -> ContourFit | None:
-        """The fit where it has the outlines of a pipe and a planned size."""
+        """The fit where it has the contour of a pipe and a planned radius; None otherwise."""
         start = Start(proposed, proposed.radius, True, depth_sigma, slope_sigma)
-        fit = refine(start, self.views, known, self.config, self.radii, follow)
+        fit = refine(start, self.views, known, self.radii, follow)
         if fit is None or fit.support < LINES_CONVINCING:
             return None
         if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq):
             return None
-        if outline_support(fit.cylinder, self.views, known).weaker_share < 0.5 * LINES_CONVINCING:
+        if contour_support(fit.cylinder, self.views, known).weaker_share < 0.5 * LINES_CONVINCING:
             return None
         return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
 
@@ -121,10 +128,11 @@ class _Lines:
 def aligned(
     proposed: Cylinder, known: Sequence[Cylinder], views: Sequence[View], slope_known_to: float
 ) -> tuple[Cylinder, float]:
-    """The cylinder as parallel to the known ones of nearly its direction as its image allows, and how sure [rad].
+    """The cylinder turned parallel to the known ones of nearly its direction, and their standard deviation [rad].
 
-    Seen from one height alone, a level pipe may as well slope towards the cameras: what else runs there tells, as far
-    as it differs by no more than the cylinder's own slope may be wrong, `slope_known_to` [rad].
+    Its image stays. Seen from one height alone, a level pipe may as well slope towards the cameras: known pipes tell
+    the slope, if they differ from it by less than three of its standard deviations, `slope_known_to` [rad]. With fewer
+    than `LEAST_PARALLEL` of them the cylinder is returned as it is, with infinity.
     """
     middle = proposed.middle
     across = np.cross(proposed.axis, viewing_direction(proposed, views))
@@ -143,8 +151,8 @@ def aligned(
     return Cylinder(middle - half, middle + half, proposed.radius), max(spread, PARALLEL_SIGMA)
 
 
-def _seen(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:
-    """The candidate that stands for a pipe found by its lines, with what the cloud (N, 3) holds of it."""
+def _as_candidate(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:
+    """A candidate for a pipe found by its lines, with what the cloud (N, 3) shows of it."""
     cylinder = fit.cylinder
     along = cylinder.along(points)
     distance = cylinder.surface_distance(points[(along > 0) & (along < cylinder.length)])

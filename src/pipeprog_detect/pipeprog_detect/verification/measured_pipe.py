@@ -1,23 +1,26 @@
-"""What the keyframes make of a candidate, and pieces of one pipe made one."""
+"""A candidate as the keyframes measured it, and collinear pieces joined to one pipe."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.cloud.collinear import join, spanning
+from pipeprog_detect.silhouette.contour_refinement import ContourFit
 from pipeprog_detect.types import Cylinder
 
-# Shorter than so many radii what the cloud does not resolve may be a hanger, a clamp, or chance.
+# What the cloud does not resolve is no pipe if it is shorter than this many radii: hangers and clamps are.
 SLENDER = 20.0
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A candidate after the images were asked: its cylinder and the standard deviation of its radius [m].
+class MeasuredPipe:
+    """A candidate after the keyframes: its cylinder and the standard deviation of its radius [m].
 
-    `rims`: what the images say for a rim at its start and at its end (`rim.End.odds`).
+    `rims`: evidence for an end rim at its start and at its end (`pipe_ends.End.odds`).
     """
 
     candidate: Candidate
@@ -25,9 +28,20 @@ class Measured:
     radius_sigma: float
     rims: tuple[float, float] = (0.0, 0.0)
 
+    @classmethod
+    def of_cloud(cls, candidate: Candidate) -> MeasuredPipe:
+        """The candidate as the cloud has it."""
+        return cls(candidate, candidate.cylinder, candidate.radius_sigma)
 
-def joined(measured: Sequence[Measured]) -> list[Measured]:
-    """Pieces of one pipe made one, as thick as the best measured: the cloud may show one, lines another."""
+    @classmethod
+    def between_ends_of(cls, candidate: Candidate, fit: ContourFit) -> MeasuredPipe:
+        """The cloud's cylinder between the ends that the keyframes show; the sigma includes the cloud's noise."""
+        sigma = float(np.hypot(candidate.radius_sigma, candidate.evidence.noise))
+        return cls(candidate, candidate.cylinder.cut_like(fit.cylinder), sigma)
+
+
+def joined(measured: Sequence[MeasuredPipe]) -> list[MeasuredPipe]:
+    """The pipes with collinear pieces joined; the radius is that of the piece with the least standard deviation."""
     whole = []
     for pieces in join([each.cylinder for each in measured]):
         best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
@@ -39,7 +53,7 @@ def joined(measured: Sequence[Measured]) -> list[Measured]:
             for end, rim in zip((piece.cylinder.start, piece.cylinder.end), piece.rims, strict=True)
         )
         candidate, rims = replace(measured[best].candidate, points=points), (along[0][1], along[-1][1])
-        whole.append(Measured(candidate, cylinder, measured[best].radius_sigma, rims))
+        whole.append(MeasuredPipe(candidate, cylinder, measured[best].radius_sigma, rims))
     return whole
 
 

@@ -1,4 +1,4 @@
-"""What is known from the last map, so that neither cloud nor keyframes are asked again while nothing has changed."""
+"""Measurements of the last map, which stand as long as nothing that they depend on has changed."""
 
 from __future__ import annotations
 
@@ -10,31 +10,60 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.collinear import near
 from pipeprog_detect.cloud.map_change import MapChange
-from pipeprog_detect.silhouette.apparent_contour import inside
+from pipeprog_detect.silhouette.apparent_contour import in_image
 from pipeprog_detect.silhouette.contour_refinement import ContourFit
 from pipeprog_detect.types import Cylinder, View
 
-# A candidate is the same while it moves by less than the cloud's own scatter [m] and a share of its radius.
+# A candidate is the same while its ends move by less than the cloud's own scatter [m] and a share of its radius, and
+# its radius changes by less than that share.
 _MOVED, _CHANGED = 2e-3, 0.03
-# Poses are the same while the images move by less than a tenth of a pixel: metres, and radians at 700 px focal length.
+# Poses are the same while the images move by less than a tenth of a pixel: metres at 1.4 m, and radians, at a focal
+# length of 700 px.
 _SHIFTED, _TURNED = 2e-4, 1.5e-4
-# Pipes that come so near [m] may hide one another.
+# Pipes that come nearer than this [m] may hide one another.
 _BESIDE = 0.3
+# Views that see this part of the axis, in lengths from the start, may see the pipe or what it is extended to.
+_AROUND = np.linspace(-0.5, 1.5, 9)
 
 
 @dataclass(frozen=True)
-class _Answer:
-    """A question about a cylinder, what it depended on, and the answer."""
+class Question:
+    """What a contour fit depends on.
+
+    Attributes:
+        cylinder: where it started.
+        follow: whether the ends were sought.
+        others: cylinders near enough to hide it.
+        poses: camera_from_map (4, 4) by stamp of the views that may see it.
+    """
 
     cylinder: Cylinder
     follow: bool
     others: list[Cylinder]
     poses: dict[int, FloatArray]
-    fit: ContourFit | None
+
+    @classmethod
+    def of(cls, cylinder: Cylinder, follow: bool, others: Sequence[Cylinder], views: Sequence[View]) -> Question:
+        """The question of a fit among all `others` and `views`."""
+        beside = [other for other in others if near(other, cylinder, _BESIDE)]
+        around = cylinder.at(_AROUND)
+        poses = {view.stamp: view.camera_from_map for view in views if in_image(view, around).any()}
+        return cls(cylinder, follow, beside, poses)
+
+    def is_answered_by(self, earlier: Question) -> bool:
+        """Whether nothing that the fit depends on has changed since an earlier question."""
+        return (
+            earlier.follow == self.follow
+            and _unchanged(earlier.cylinder, self.cylinder)
+            and earlier.poses.keys() == self.poses.keys()
+            and all(_same_pose(pose, self.poses[stamp]) for stamp, pose in earlier.poses.items())
+            and len(earlier.others) == len(self.others)
+            and all(any(_unchanged(one, other) for other in self.others) for one in earlier.others)
+        )
 
 
-class Memory:
-    """Fits of the last map by candidate; for one survey, whose keyframes keep their stamps and images.
+class MeasurementCache:
+    """Contour fits of the last map; for one survey, whose keyframes keep their stamps and images.
 
     `novelty`: what the last map's cloud was like.
     `edges`: straight edges (N, 2, 2) [px] by a keyframe's stamp and the width at which they were sought.
@@ -43,56 +72,24 @@ class Memory:
     def __init__(self) -> None:
         self.novelty = MapChange()
         self.edges: dict[tuple[int, int], FloatArray] = {}
-        self._last: list[_Answer] = []
-        self._current: list[_Answer] = []
+        self._last: list[tuple[Question, ContourFit | None]] = []
+        self._current: list[tuple[Question, ContourFit | None]] = []
 
     def next_map(self) -> None:
-        """Forgets what the map before the last one needed."""
+        """Forgets what only the map before the last one needed."""
         self._last, self._current = self._current, []
 
-    def recall(
-        self, cylinder: Cylinder, follow: bool, others: Sequence[Cylinder], views: Sequence[View]
-    ) -> tuple[bool, ContourFit | None]:
-        """Whether the answer is known, and the fit (None: there is none)."""
-        poses = _poses(cylinder, views)
-        beside = _beside(cylinder, others)
-        for answer in self._last:
-            if (
-                answer.follow == follow
-                and _alike(answer.cylinder, cylinder)
-                and _unmoved(answer.poses, poses)
-                and len(answer.others) == len(beside)
-                and all(any(_alike(one, other) for other in beside) for one in answer.others)
-            ):
-                self._current.append(answer)
-                return True, answer.fit
+    def recall(self, question: Question) -> tuple[bool, ContourFit | None]:
+        """Whether the last map answers the question, and the fit (None: there is none)."""
+        for earlier, fit in self._last:
+            if question.is_answered_by(earlier):
+                self._current.append((earlier, fit))
+                return True, fit
         return False, None
 
-    def keep(
-        self,
-        cylinder: Cylinder,
-        follow: bool,
-        others: Sequence[Cylinder],
-        views: Sequence[View],
-        fit: ContourFit | None,
-    ) -> None:
-        """Remembers an answer for the next map."""
-        self._current.append(_Answer(cylinder, follow, _beside(cylinder, others), _poses(cylinder, views), fit))
-
-
-def _beside(cylinder: Cylinder, others: Sequence[Cylinder]) -> list[Cylinder]:
-    return [other for other in others if near(other, cylinder, _BESIDE)]
-
-
-def _poses(cylinder: Cylinder, views: Sequence[View]) -> dict[int, FloatArray]:
-    """camera_from_map (4, 4) by stamp of the views that may see the cylinder or what it grows to."""
-    share = np.linspace(-0.5, 1.5, 9)[:, None]
-    points = cylinder.start + share * (cylinder.end - cylinder.start)
-    return {view.stamp: view.camera_from_map for view in views if inside(view, points).any()}
-
-
-def _unmoved(one: dict[int, FloatArray], other: dict[int, FloatArray]) -> bool:
-    return one.keys() == other.keys() and all(_same_pose(pose, other[stamp]) for stamp, pose in one.items())
+    def keep(self, question: Question, fit: ContourFit | None) -> None:
+        """Keeps an answer for the next map."""
+        self._current.append((question, fit))
 
 
 def _same_pose(one: FloatArray, other: FloatArray) -> bool:
@@ -101,6 +98,6 @@ def _same_pose(one: FloatArray, other: FloatArray) -> bool:
     return turn < np.sqrt(2.0) * _TURNED and shift < _SHIFTED
 
 
-def _alike(one: Cylinder, other: Cylinder) -> bool:
+def _unchanged(one: Cylinder, other: Cylinder) -> bool:
     moved = max(float(np.linalg.norm(one.start - other.start)), float(np.linalg.norm(one.end - other.end)))
     return moved < _MOVED + _CHANGED * one.radius and abs(one.radius - other.radius) < _CHANGED * one.radius

@@ -1,4 +1,4 @@
-"""What is around a cylinder says about its side: a pipe is seen from outside, rounds no corner, lies in no wall."""
+"""What surrounds a cylinder: a pipe is seen from outside, is not the rounding of a corner, and lies in no wall."""
 
 from __future__ import annotations
 
@@ -21,21 +21,28 @@ _ALONG = float(np.sin(np.radians(6.0)))
 _TANGENT = 0.15
 # Planes that meet at less than 30 deg make no corner.
 _CORNER = float(np.cos(np.radians(30.0)))
-# Walls are looked at in steps [m] of a cylinder's length, as far beside it as so many radii or metres, ...
+# Walls are looked at in steps [m] of a cylinder's length, up to this far beside its surface: in radii, at least in
+# metres.
 _STEP, _BESIDE, _LEAST_BESIDE = 0.05, 3.0, 0.03
-# ... aslant up to so many times as far before and behind it; so many points tell where one is.
+# They are looked at before and behind it up to this many times as far (walls aslant to the view). The median of three
+# points tells where a wall is, one of them being astray.
 _ASLANT, _LEAST_POINTS = 3.0, 3
 # A cylinder whose axis lies behind the wall, or before it by less than this share of the radius, is in it.
 _IN_WALL = 0.5
-# Walls are flat to so much [m] over that.
+# Walls deviate from a plane by this much [m] over that width.
 _WAVINESS = 1e-3
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """The points beside large planes, their normals (N, 3) towards the sensor (None: not known), and the planes.
+class SceneContext:
+    """What surrounds the candidates.
 
-    `walls`: points on the planes; `sigma` [m]: the cloud's noise.
+    Attributes:
+        tree: the points beside large planes.
+        outward: their normals (N, 3) towards the sensor; None where they are not known.
+        planes: large planes: walls, floors, ceilings.
+        walls: points on these planes.
+        sigma: standard deviation of the cloud's noise [m].
     """
 
     tree: Octree
@@ -54,8 +61,8 @@ class Surroundings:
         rows, radial = self._surface(candidate)
         return float(np.einsum("ij,ij->i", radial, self.outward[rows]).mean()) if len(rows) else 0.0
 
-    def contradict(self, candidate: Candidate) -> bool:
-        """Whether they make it no pipe: it is hollow, or rounds the edge or the corner of two planes.
+    def rejects(self, candidate: Candidate) -> bool:
+        """Whether a candidate is no pipe: it is hollow, or the rounding of the edge or corner of two planes.
 
         Such a rounding is tangent to both planes, and lies where they would meet; a pipe in a corner shows its other
         side.
@@ -76,12 +83,12 @@ class Surroundings:
         front = self._surface(candidate)[1].mean(axis=0)
         return any(float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner) for corner in corners)
 
-    def bury(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
+    def is_embedded(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
         """Whether more than half of the cylinder, looked at along `towards` (3,), would lie within walls.
 
-        The outlines are seen where the view touches the cylinder, beside its axis and hardly nearer than that: a wall
-        that shows its own face nearer than the axis on both sides would hide both of them. What the view says of the
-        depth may be off by some of the radius, and a pipe on a wall has its axis a whole radius before it.
+        The contour is where the line of sight touches the cylinder, beside its axis and hardly nearer: a wall whose
+        own face is nearer than the axis on both sides would hide both lines. The depth that the views tell may be
+        wrong by a share of the radius, and the axis of a pipe on a wall is a whole radius before it.
         """
         sideways, depth = frame(cylinder, towards)
         reach = cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE)

@@ -1,4 +1,4 @@
-"""Pipes that run into walls, floors and ceilings: ends that no keyframe shows, and ends that lie behind a wall."""
+"""Ends at walls, floors and ceilings: those that no keyframe shows, and those that lie behind the wall."""
 
 from __future__ import annotations
 
@@ -10,47 +10,53 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
-from pipeprog_detect.silhouette.apparent_contour import showing
-from pipeprog_detect.silhouette.extension import outline_evidence
-from pipeprog_detect.silhouette.limb_edges import SHARP
+from pipeprog_detect.silhouette.apparent_contour import views_showing
+from pipeprog_detect.silhouette.extension import axial_evidence
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.scene_context import SceneContext
 
-# An axis meets a plane at more than 30 deg, or it rather runs along it.
+# An axis meets a plane at more than 30 deg, or it runs along it.
 MEETS = 0.5
-# A plane is there where some of its points, so near to it, lie within so much of the place [m]: what hides a pipe's end
-# hides the floor beside it, too.
+# A plane exists at a position where at least this many of its points, nearer to it than the first distance [m], lie
+# within the second [m]: what hides a pipe's end hides the floor beside it, too.
 ON_PLANE, NEAR, LEAST_POINTS = 0.01, 0.5, 10
-# Planes that an axis meets within so much [m] are one.
+# Planes that an axis meets within this distance [m] are one.
 SAME_PLANE = 0.05
-# A plane goes on all around a pipe that passes it where its points lie in so many of the sectors about the pipe.
-SECTORS, CLOSED = 8, 6
+# A plane surrounds a pipe that passes it where its points lie in six of the eight sectors around the pipe, and no
+# farther than this from it [radii, m].
+SECTORS, CLOSED, CLOSE_RADII, CLOSE = 8, 6, 4.0, 0.05
 # Views that suffice to tell whether the pipe goes on.
 ENOUGH_VIEWS = 12
 
 
-def abutted(
+def with_ends_on_walls(
     cylinder: Cylinder,
     rims: tuple[float, float],
-    planes: Sequence[Plane],
-    walls: Octree,
+    context: SceneContext,
     views: Sequence[View],
     others: Sequence[Cylinder],
 ) -> Cylinder:
-    """The cylinder with its ends on the planes, of which `walls` are points, where it runs into them.
+    """The cylinder with its ends on the planes of the `context` that it runs into.
 
-    `rims`: what the images say for a rim at the start and at the end (`rim.End.odds`).
+    Prior: ends occur along a pipe as a Poisson process with one end per measured length. Where the keyframes do not
+    show that the pipe stops before a plane, it is the more probable that it goes on to the plane the nearer that is.
+    A part that lies behind a plane as seen from every camera, and that the plane surrounds, was not seen: it is cut.
 
-    Ends come along a pipe at a rate of one in its own length, for what is known. Where the keyframes do not show that
-    it stops before a plane, that it goes on to it is the more probable the nearer the plane is. What lies behind a
-    plane as seen from every camera, and is closed in by it, was not seen.
+    Args:
+        cylinder: the measured pipe.
+        rims: evidence for an end rim at its start and at its end (`pipe_ends.End.odds`).
+        context: the planes and their points.
+        views: the keyframes.
+        others: further pipes, which may hide this one.
     """
     ends = []
     for at_end in (False, True):
         end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
         ahead: list[float] = []
-        for plane in sorted(planes, key=lambda plane: -plane.area):
-            distance = _distance(end, out, cylinder, plane, walls, views)
-            # Small planes are pieces of large ones, and know less well where these are.
+        for plane in sorted(context.planes, key=lambda plane: -plane.area):
+            distance = _distance(end, out, cylinder, plane, context.walls, views)
+            # Small planes are pieces of large ones, whose position they tell less precisely.
             if distance is not None and all(abs(distance - other) > SAME_PLANE for other in ahead):
                 ahead.append(distance)
         nearest = min(ahead, default=0.0)
@@ -87,7 +93,7 @@ def _closed(offset: FloatArray, axis: FloatArray, radius: float) -> bool:
     """Whether the points (N, 3), given from where the axis passes, lie close to the pipe on most of its sides."""
     u, v = basis(axis)
     x, y = offset @ u, offset @ v
-    close = np.hypot(x, y) < 4.0 * radius + 0.05
+    close = np.hypot(x, y) < CLOSE_RADII * radius + CLOSE
     sector = ((np.arctan2(y[close], x[close]) / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     return len(np.unique(sector)) >= CLOSED
 
@@ -97,12 +103,11 @@ def _goes_on(
 ) -> bool:
     """Whether it is more probable that the pipe goes on for `ahead` [m] than that it ends within that."""
     end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
-    looking = showing(end + np.linspace(0.0, 1.0, 5)[:, None] * ahead * out, views, ENOUGH_VIEWS)
+    looking = views_showing(end + np.linspace(0.0, 1.0, 5)[:, None] * ahead * out, views, ENOUGH_VIEWS)
     total: FloatArray = np.zeros(1)
     place: FloatArray = np.zeros(1)
     if looking:
-        still = np.zeros(len(looking))
-        evidence = outline_evidence(cylinder, at_end, ahead, looking, others, still, SHARP)
+        evidence = axial_evidence(cylinder, at_end, ahead, Scene.of(cylinder, looking, others))
         if evidence is None:
             return False
         beyond = (evidence.along > 0.0) & (evidence.along < ahead)

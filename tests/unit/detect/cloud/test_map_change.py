@@ -12,7 +12,7 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cloud, Cylinder
-from pipeprog_detect.verification.measurement_cache import Memory
+from pipeprog_detect.verification.measurement_cache import MeasurementCache
 
 BOQ = BillOfQuantities(tuple(PipeClass(f"{1e3 * r:g}", r, 4.0, (1.0, 0.0, 0.0), 0.01 * r) for r in (0.0365, 0.0575)))
 NOISE = 2e-3
@@ -61,7 +61,7 @@ def test_a_place_that_is_seen_better_is_news() -> None:
     assert novelty.of(wall(0, 1)).all()
 
 
-def found(cloud: np.ndarray, memory: Memory) -> list[Cylinder]:
+def found(cloud: np.ndarray, memory: MeasurementCache) -> list[Cylinder]:
     return [pipe.cylinder for pipe in detect(Cloud(cloud), BOQ, DetectConfig(), memory=memory)]
 
 
@@ -72,7 +72,7 @@ def near(cylinder: Cylinder, truth: Cylinder) -> bool:
 
 def test_pipes_of_a_growing_map_are_those_of_the_whole() -> None:
     """Known pipes stay, new ones come, one that grows is grown, one that is gone goes; the old is not sought again."""
-    memory = Memory()
+    memory = MeasurementCache()
     (first, first_points), (half, half_points), (whole, whole_points) = pipe(0.3), pipe(0.7, high=0.5), pipe(0.7)
     assert all(map(near, found(np.concatenate([wall(0, 1), first_points, half_points]), memory), (first, half)))
     last, last_points = pipe(1.5, 0.0575)

@@ -7,10 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.apparent_contour import frame
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.edge_support import support
+from pipeprog_detect.silhouette.edge_support import contour_support
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
@@ -19,7 +18,6 @@ UP = np.array([0.0, 0.0, 1.0])
 RADIUS_TOLERANCE = 0.35e-3
 # [m] The axis is as good across the view; along it by distance over half the baseline worse, 1.2 m / 0.45 m.
 AXIS_TOLERANCE = 0.35e-3 * 1.2 / 0.45
-CONFIG = ContourConfig()
 
 
 def disturbed(random: np.random.Generator) -> Cylinder:
@@ -33,7 +31,7 @@ def disturbed(random: np.random.Generator) -> Cylinder:
 def test_converges_from_every_start_beside_a_shadow(pipe_views: list[View]) -> None:
     random = np.random.default_rng(5)
     for _ in range(4):
-        fit = refine(Start(disturbed(random), 0.1 * PIPE.radius), pipe_views, [], CONFIG)
+        fit = refine(Start(disturbed(random), 0.1 * PIPE.radius), pipe_views, [])
         assert fit is not None
         assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=RADIUS_TOLERANCE)
         assert abs(fit.cylinder.radius - PIPE.radius) < 3.0 * fit.radius_sigma < 2e-3
@@ -51,8 +49,8 @@ def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[
         pose = view.camera_from_map.copy()
         pose[:3, 3] += random.normal(0.0, 1.5e-3, 3)
         noisy.append(dataclasses.replace(view, camera_from_map=pose))
-    clean = refine(Start(PIPE, 0.002), pipe_views, [], CONFIG)
-    fit = refine(Start(PIPE, 0.002), noisy, [], CONFIG)
+    clean = refine(Start(PIPE, 0.002), pipe_views, [])
+    fit = refine(Start(PIPE, 0.002), noisy, [])
     assert clean is not None
     assert fit is not None
     assert abs(fit.cylinder.radius - PIPE.radius) < 3.0 * fit.radius_sigma
@@ -62,22 +60,22 @@ def test_wrong_poses_widen_the_axis_sigma_and_spare_the_radius(pipe_views: list[
 
 def test_the_ends_are_found_from_a_short_start(pipe_views: list[View]) -> None:
     short = Cylinder(PIPE.start + 0.04 * PIPE.axis, PIPE.end - 0.04 * PIPE.axis, PIPE.radius)
-    fit = refine(Start(short, 0.002), pipe_views, [], CONFIG)
+    fit = refine(Start(short, 0.002), pipe_views, [])
     assert fit is not None
     # One pixel along the pipe, and what the rim is worth against it.
     assert fit.cylinder.length == pytest.approx(PIPE.length, abs=3.5e-3)
 
 
 def test_a_catalogue_radius_does_not_pull(pipe_views: list[View]) -> None:
-    free = refine(Start(PIPE, 0.003), pipe_views, [], CONFIG)
-    seeded = refine(Start(PIPE, 0.003), pipe_views, [], CONFIG, planned_radii=(0.042, 0.0365))
+    free = refine(Start(PIPE, 0.003), pipe_views, [])
+    seeded = refine(Start(PIPE, 0.003), pipe_views, [], planned_radii=(0.042, 0.0365))
     assert free is not None
     assert seeded is not None
     assert seeded.cylinder.radius == pytest.approx(free.cylinder.radius, abs=2e-5)
 
 
 def test_same_input_same_result(pipe_views: list[View]) -> None:
-    first, second = (refine(Start(PIPE, 0.003), pipe_views, [], CONFIG) for _ in range(2))
+    first, second = (refine(Start(PIPE, 0.003), pipe_views, []) for _ in range(2))
     assert first is not None
     assert second is not None
     assert first.cylinder.radius == second.cylinder.radius
@@ -85,23 +83,22 @@ def test_same_input_same_result(pipe_views: list[View]) -> None:
 
 
 def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
-    assert refine(Start(PIPE, 0.004), empty_views, [], CONFIG) is None
-    assert refine(Start(PIPE, 0.004), [], [], CONFIG) is None
-    assert refine(Start(PIPE, 0.004), empty_views, [], ContourConfig(enabled=False)) is None
+    assert refine(Start(PIPE, 0.004), empty_views, []) is None
+    assert refine(Start(PIPE, 0.004), [], []) is None
     above = Cylinder(PIPE.start + 3.0 * UP, PIPE.end + 3.0 * UP, PIPE.radius)
-    assert refine(Start(above, 0.004), empty_views, [], CONFIG) is None
+    assert refine(Start(above, 0.004), empty_views, []) is None
 
 
 def test_support_tells_a_pipe_from_a_guess(pipe_views: list[View], empty_views: list[View]) -> None:
     thick = Cylinder(PIPE.start, PIPE.end, 1.2 * PIPE.radius)
-    assert support(PIPE, pipe_views, []) > 0.9
-    assert support(thick, pipe_views, []) < 0.2
-    assert support(PIPE, empty_views, []) < 0.2
+    assert contour_support(PIPE, pipe_views, []).share > 0.9
+    assert contour_support(thick, pipe_views, []).share < 0.2
+    assert contour_support(PIPE, empty_views, []).share < 0.2
 
 
 def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:
     screen = Cylinder(np.array([-0.5, -0.3, 0.0]), np.array([0.5, -0.3, 0.0]), 0.05)
-    fit = refine(Start(PIPE, 0.002), pipe_views, [screen], CONFIG)
+    fit = refine(Start(PIPE, 0.002), pipe_views, [screen])
     assert fit is not None
     assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=RADIUS_TOLERANCE)
 
@@ -119,7 +116,7 @@ def test_no_radius_is_below_zero_where_edges_of_texture_pull_it(
     for views in (empty_views, pipe_views):
         for radius in (0.3e-3, 0.6e-3, 1e-3):
             thread = Cylinder(PIPE.start + place, PIPE.end + place - [0.0, 0.0, 0.2], radius)
-            fit = refine(Start(thread, radius, radius_known, 0.03), views, [], ContourConfig(), [radius])
+            fit = refine(Start(thread, radius, radius_known, 0.03), views, [], [radius])
             if on_an_edge is not None:
                 assert (fit is not None) == (on_an_edge and views is pipe_views)
             if fit is not None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, SupportProfile, outline_support, own_outlines, support
+from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, SupportProfile, contour_support, own_contours
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
@@ -23,25 +23,25 @@ def ghost_of(pipe: Cylinder, views: list[View]) -> Cylinder:
 def test_a_ghost_behind_a_pipe_has_no_outlines_of_its_own(pipe_views: list[View]) -> None:
     views = pipe_views[2:6]
     ghost = ghost_of(PIPE, views)
-    assert support(ghost, views, []) > MIN_SUPPORT
-    assert own_outlines([ghost, PIPE], views).tolist() == [False, True]
-    assert own_outlines([PIPE, ghost], views).tolist() == [True, False]
+    assert contour_support(ghost, views, []).share > MIN_SUPPORT
+    assert own_contours([ghost, PIPE], views).tolist() == [False, True]
+    assert own_contours([PIPE, ghost], views).tolist() == [True, False]
 
 
 def test_a_pipe_alone_keeps_its_outlines_and_what_never_had_any_is_not_judged_by_them(pipe_views: list[View]) -> None:
     aside = np.array([0.2, 0.0, 0.0])
     nothing = Cylinder(PIPE.start + aside, PIPE.end + aside, PIPE.radius)
-    assert support(nothing, pipe_views, []) < MIN_SUPPORT
-    assert own_outlines([PIPE, nothing], pipe_views).tolist() == [True, True]
+    assert contour_support(nothing, pipe_views, []).share < MIN_SUPPORT
+    assert own_contours([PIPE, nothing], pipe_views).tolist() == [True, True]
 
 
 def test_an_edge_that_is_one_outline_of_a_cylinder_is_not_both(pipe_views: list[View]) -> None:
     aside = np.array([1.5 * PIPE.radius, 0.0, 0.0])
     beside = Cylinder(PIPE.start + aside, PIPE.end + aside, 0.5 * PIPE.radius)
-    seen = outline_support(beside, pipe_views, [])
+    seen = contour_support(beside, pipe_views, [])
     assert seen.share > 2.0 * MIN_SUPPORT
     assert seen.weaker_share < MIN_SUPPORT
-    assert outline_support(PIPE, pipe_views, []).weaker_share > 0.8
+    assert contour_support(PIPE, pipe_views, []).weaker_share > 0.8
 
 
 @pytest.mark.parametrize("views", [3, 4, 5, 8, 20])

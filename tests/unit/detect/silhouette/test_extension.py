@@ -7,25 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.extension import grown, outline_evidence
+from pipeprog_detect.silhouette.extension import axial_evidence, extended
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
 END_TOLERANCE = 2e-3  # half a pixel
-STATIONS_TOLERANCE = 0.03  # outlines alone tell an end to two stations of 6 px
+SAMPLES_TOLERANCE = 0.03  # the contour alone tells an end to two samples of 6 px
 
 
 @pytest.mark.parametrize("piece", [(0.0, 0.16), (0.12, 0.28), (0.24, 0.4)])
 def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[float, float]) -> None:
     low, high = (PIPE.start + place * PIPE.axis for place in piece)
-    fit = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], ContourConfig())
+    fit = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [])
     assert fit is not None
     assert (fit.cylinder.start - PIPE.start) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
     assert (fit.cylinder.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=END_TOLERANCE)
     assert fit.cylinder.radius == pytest.approx(PIPE.radius, abs=0.5e-3)
-    short = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], ContourConfig(), follow=False)
+    short = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [], follow=False)
     assert short is not None
     assert short.cylinder.length < 0.2
 
@@ -41,14 +41,14 @@ def test_a_piece_too_short_to_tell_its_direction_grows_in_the_one_that_its_edges
         for view in pipe_views
     ]
     low = PIPE.start + place * PIPE.axis
-    fit = refine(Start(Cylinder(low, low + length * PIPE.axis, PIPE.radius), 0.002), views, [], ContourConfig())
+    fit = refine(Start(Cylinder(low, low + length * PIPE.axis, PIPE.radius), 0.002), views, [])
     assert fit is not None
     assert fit.cylinder.length == pytest.approx(PIPE.length, abs=2.0 * END_TOLERANCE)
 
 
 def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[View], empty_views: list[View]) -> None:
     for views in (pipe_views, empty_views):
-        same = grown(PIPE, views, [], np.zeros(len(views)), 0.5)
+        same = extended(PIPE, Scene.of(PIPE, views, []))
         assert same.length == pytest.approx(PIPE.length, abs=1e-9)
 
 
@@ -57,15 +57,14 @@ def test_what_hides_a_pipe_does_not_end_it(pipe_views: list[View]) -> None:
     known = Cylinder(PIPE.start, PIPE.start + 0.16 * PIPE.axis, PIPE.radius)
     crossing = PIPE.start + 0.24 * PIPE.axis + np.array([0.0, -0.15, 0.0])
     rod = Cylinder(crossing - np.array([0.4, 0.0, 0.0]), crossing + np.array([0.4, 0.0, 0.0]), 0.03)
-    still = np.zeros(len(pipe_views))
-    once = grown(known, pipe_views, [rod], still, 0.5)
-    twice = grown(once, pipe_views, [rod], still, 0.5)
-    assert (twice.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=STATIONS_TOLERANCE)
+    scene = Scene.of(known, pipe_views, [rod])
+    twice = extended(extended(known, scene), scene)
+    assert (twice.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=SAMPLES_TOLERANCE)
 
 
 def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
     short = Cylinder(PIPE.start, PIPE.end - 0.1 * PIPE.axis, PIPE.radius)
-    evidence = outline_evidence(short, True, 0.25, pipe_views, [], np.zeros(len(pipe_views)), 0.5)
+    evidence = axial_evidence(short, True, 0.25, Scene.of(short, pipe_views, []))
     assert evidence is not None
     step = evidence.along[1] - evidence.along[0]
     assert evidence.log_odds[(evidence.along > 0) & (evidence.along < 0.1 - step)].min() > 0
@@ -73,4 +72,4 @@ def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
 
 
 def test_no_evidence_without_a_pipe(empty_views: list[View]) -> None:
-    assert outline_evidence(PIPE, True, 0.2, empty_views, [], np.zeros(len(empty_views)), 0.5) is None
+    assert axial_evidence(PIPE, True, 0.2, Scene.of(PIPE, empty_views, [])) is None

@@ -7,7 +7,7 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.silhouette.occlusion import BEFORE, behind, with_depths
+from pipeprog_detect.silhouette.occlusion import BEFORE, hidden_by_cloud, with_depths
 from pipeprog_detect.types import View
 
 
@@ -33,15 +33,15 @@ def _seen_at(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
 def test_a_plate_hides_what_lies_behind_it(view: View) -> None:
     with_cloud = with_depths([view], np.concatenate([_plate(1.0, -0.6, 0.0), _plate(2.0, -1.0, 1.0)]))[0]
     wall = np.array([[-0.6, 0.1, 2.0], [-0.2, 0.0, 2.0], [0.2, 0.0, 2.0], [0.6, -0.1, 2.0]])
-    assert behind(with_cloud, *_seen_at(view, wall)).tolist() == [True, True, False, False]
+    assert hidden_by_cloud(with_cloud, *_seen_at(view, wall)).tolist() == [True, True, False, False]
     plate = np.array([[-0.4, 0.1, 1.0 + 0.8 * BEFORE], [-0.1, 0.0, 1.0 + 0.8 * BEFORE]])
-    assert not behind(with_cloud, *_seen_at(view, plate)).any()
+    assert not hidden_by_cloud(with_cloud, *_seen_at(view, plate)).any()
 
 
 def test_without_a_cloud_nothing_is_hidden(view: View) -> None:
-    assert not behind(view, np.array([[100.0, 50.0]]), np.array([3.0])).any()
+    assert not hidden_by_cloud(view, np.array([[100.0, 50.0]]), np.array([3.0])).any()
     empty = with_depths([view], np.zeros((0, 3)))[0]
-    assert not behind(empty, np.array([[100.0, 50.0]]), np.array([3.0])).any()
+    assert not hidden_by_cloud(empty, np.array([[100.0, 50.0]]), np.array([3.0])).any()
 
 
 def test_a_slanted_surface_does_not_hide_itself(view: View) -> None:
@@ -49,4 +49,4 @@ def test_a_slanted_surface_does_not_hide_itself(view: View) -> None:
     row = np.array([-0.4, 0.0, 1.0]) + share * np.array([0.8, 0.0, 3.0])
     strip = np.concatenate([row + np.array([0.0, y, 0.0]) for y in np.arange(-0.1, 0.1, 0.004)])
     seen = with_depths([view], strip)[0]
-    assert not behind(seen, *_seen_at(view, row[::50])).any()
+    assert not hidden_by_cloud(seen, *_seen_at(view, row[::50])).any()

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.apparent_contour import frame, moved, viewing_direction
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.one_sided import SeenArc, lone_limb, precision
+from pipeprog_detect.silhouette.one_sided import SeenArc, arc_precision, only_visible_side
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
@@ -21,22 +21,19 @@ def side_of_the_neighbour(views: list[View]) -> float:
 
 
 def test_the_outline_away_from_the_neighbour_is_the_only_one(pipe_views: list[View]) -> None:
-    basis = frame(PIPE, viewing_direction(PIPE, pipe_views))
-    assert lone_limb(PIPE, pipe_views, [NEIGHBOUR], basis, 12) == -side_of_the_neighbour(pipe_views)
-    assert lone_limb(PIPE, pipe_views, [], basis, 12) is None
+    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [NEIGHBOUR])) == -side_of_the_neighbour(pipe_views)
+    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [])) is None
 
 
 def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View]) -> None:
-    basis = frame(PIPE, viewing_direction(PIPE, pipe_views))
-
     def up_to(height: float) -> Cylinder:
         share = (height - NEIGHBOUR.start[2]) / (NEIGHBOUR.end[2] - NEIGHBOUR.start[2])
         return Cylinder(NEIGHBOUR.start, NEIGHBOUR.start + share * (NEIGHBOUR.end - NEIGHBOUR.start), NEIGHBOUR.radius)
 
     nearly_all, half = up_to(0.065), up_to(-0.1)
-    assert lone_limb(PIPE, pipe_views, [nearly_all], basis, 12) == -side_of_the_neighbour(pipe_views)
-    assert refine(Start(PIPE, SEEN.sigma), pipe_views, [nearly_all], ContourConfig(), follow=False) is None
-    assert lone_limb(PIPE, pipe_views, [half], basis, 12) is None
+    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [nearly_all])) == -side_of_the_neighbour(pipe_views)
+    assert refine(Start(PIPE, SEEN.sigma), pipe_views, [nearly_all], follow=False) is None
+    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [half])) is None
 
 
 def test_one_outline_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
@@ -46,8 +43,8 @@ def test_one_outline_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
     middle = np.array([-side_of_the_neighbour(pipe_views) * np.cos(half), -np.sin(half)])
     step = np.concatenate([-0.004 * middle, -0.004 * middle, [0.004]])
     start = moved(PIPE, basis, step)
-    assert refine(Start(start, SEEN.sigma), pipe_views, [NEIGHBOUR], ContourConfig(), follow=False) is None
-    fit = refine(Start(start, SEEN.sigma, seen=SEEN), pipe_views, [NEIGHBOUR], ContourConfig(), follow=False)
+    assert refine(Start(start, SEEN.sigma), pipe_views, [NEIGHBOUR], follow=False) is None
+    fit = refine(Start(start, SEEN.sigma, seen=SEEN), pipe_views, [NEIGHBOUR], follow=False)
     assert fit is not None
     assert abs(fit.cylinder.radius - PIPE.radius) < 0.5 * abs(start.radius - PIPE.radius)
     assert abs(fit.cylinder.radius - PIPE.radius) < 2.0 * fit.radius_sigma < 6e-3
@@ -56,7 +53,7 @@ def test_one_outline_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
 @pytest.mark.parametrize("limb", [-1.0, 1.0])
 def test_an_arc_leaves_the_radius_open_along_its_sagitta(limb: float) -> None:
     """Moving the seen surface costs most; growing so that it stays costs what the sagitta tells."""
-    information = precision(SEEN, limb)
+    information = arc_precision(SEEN, limb)
     half = 0.5 * SEEN.arc
     middle = np.array([limb * np.cos(half), -np.sin(half)])
     along = np.concatenate([-middle, -middle, [1.0]])

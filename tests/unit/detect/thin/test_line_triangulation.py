@@ -1,13 +1,12 @@
-"""Thin pipes by lines in the images: edges, ribbons, and what tells a pipe from a painted strip."""
+"""Thin pipes by lines in the images: edges, segment_pairs, and what tells a pipe from a painted strip."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.thin.line_segments import ribbons, straight_edges
+from pipeprog_detect.thin.line_segments import segment_pairs, straight_edges
 from pipeprog_detect.thin.line_triangulation import propose
 from pipeprog_detect.thin.thin_pipes import FLAT, SURELY
 from pipeprog_detect.types import Cylinder, View
@@ -27,11 +26,11 @@ def test_edges_of_a_band_make_one_ribbon() -> None:
     image[:, 140:152] = 180
     edges = straight_edges(image)
     assert len(edges) == 2
-    found = ribbons(edges, 5.0, 20.0)
+    found = segment_pairs(edges, 5.0, 20.0)
     assert len(found) == 1
     assert found.width == pytest.approx(12.0, abs=0.5)
     assert found.ends[..., 0] == pytest.approx(145.5, abs=0.5)
-    assert len(ribbons(edges, 15.0, 20.0)) == 0
+    assert len(segment_pairs(edges, 15.0, 20.0)) == 0
 
 
 def test_pieces_of_one_edge_are_joined_and_a_blank_image_has_none() -> None:
@@ -61,14 +60,14 @@ def test_known_pipes_and_strips_on_the_wall_are_not_proposed(pipe_views: list[Vi
 
 
 def test_outlines_of_a_strip_stay_where_they_are(pipe_views: list[View]) -> None:
-    pipe = refine(Start(PIPE, 0.004), pipe_views, [], ContourConfig())
+    pipe = refine(Start(PIPE, 0.004), pipe_views, [])
     assert pipe is not None
     assert abs(pipe.flatness) < 0.3
     assert pipe.flatness_sigma < 0.3
     # The shadow is seen beside the pipe in the lower half of the walk's images, too.
     at = np.array([SHADOW + SHADOW_RADIUS, WALL, 0.0])
     up = np.array([0.0, 0.0, 0.2])
-    strip = refine(Start(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002), pipe_views, [PIPE], ContourConfig())
+    strip = refine(Start(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002), pipe_views, [PIPE])
     assert strip is not None
     assert abs(strip.flatness - FLAT) < strip.flatness_sigma, "soft edges: the walk tells half of it"
     assert strip.flatness - pipe.flatness > SURELY * np.hypot(strip.flatness_sigma, pipe.flatness_sigma)
@@ -78,8 +77,8 @@ def test_a_known_slope_holds_what_one_height_leaves_open(pipe_views: list[View])
     """From cameras almost in a plane with the axis the slope towards them is seen badly; that is what is given."""
     few = pipe_views[2:6]
     sloping = Cylinder(PIPE.start + np.array([0.0, 0.02, 0.0]), PIPE.end, PIPE.radius)
-    free = refine(Start(sloping, PIPE.radius, True, 0.03), few, [], ContourConfig(), RADII, False)
-    held = refine(Start(sloping, PIPE.radius, True, 0.03, np.radians(0.05)), few, [], ContourConfig(), RADII, False)
+    free = refine(Start(sloping, PIPE.radius, True, 0.03), few, [], RADII, False)
+    held = refine(Start(sloping, PIPE.radius, True, 0.03, np.radians(0.05)), few, [], RADII, False)
     assert free is not None
     assert held is not None
     turned = [np.arccos(min(abs(float(fit.cylinder.axis @ sloping.axis)), 1.0)) for fit in (free, held)]

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
-from pipeprog_detect.config import ContourConfig
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.keyframe_verifier import Jury
+from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from tests.unit.detect.pipe_and_wall import PIPE
 from tests.unit.detect.straight_ahead import looking_along_y
 
@@ -22,5 +21,5 @@ def test_a_pipe_that_few_keyframes_of_many_show_is_vouched_for(pipe_views: list[
     evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
     rough = Cylinder(PIPE.start, PIPE.end, 0.042)
     candidate = Candidate(rough, 0.002, 900, evidence)
-    assert Jury(views, BOQ, ContourConfig()).vouches_for(candidate)
-    assert not Jury(elsewhere, BOQ, ContourConfig()).vouches_for(candidate)
+    assert KeyframeVerifier(views, BOQ).verify(candidate)
+    assert not KeyframeVerifier(elsewhere, BOQ).verify(candidate)

@@ -6,17 +6,17 @@ import numpy as np
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.types import Cylinder
-from pipeprog_detect.verification.measured_pipe import Measured, joined
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined
 
 
 def test_a_piece_found_by_its_lines_is_one_pipe_with_that_of_the_cloud() -> None:
     """As thick as the better measured one; another pipe on its line, too far on, stays one of its own."""
 
-    def piece(low: float, high: float, radius_sigma: float, points: int) -> Measured:
+    def piece(low: float, high: float, radius_sigma: float, points: int) -> MeasuredPipe:
         cylinder = Cylinder(np.array([low, 0.0, 0.0]), np.array([high, 0.0, 0.002]), 0.0086 + radius_sigma)
         evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
         candidate = Candidate(cylinder, radius_sigma, points, evidence)
-        return Measured(candidate, cylinder, radius_sigma)
+        return MeasuredPipe(candidate, cylinder, radius_sigma)
 
     far, short, long = piece(8.0, 9.0, 1e-4, 300), piece(0.0, 0.8, 3e-4, 500), piece(1.0, 3.0, 2e-4, 100)
     found = joined([far, short, long])

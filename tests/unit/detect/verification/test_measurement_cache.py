@@ -11,7 +11,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.measurement_cache import Memory
+from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question
 from tests.unit.detect.pipe_and_wall import PIPE
 
 FAR = Cylinder(PIPE.start + 2.0, PIPE.end + 2.0, 0.04)
@@ -23,35 +23,35 @@ def shifted(views: list[View], by: float, which: int) -> list[View]:
     return [*views[:which], dataclasses.replace(views[which], camera_from_map=moved), *views[which + 1 :]]
 
 
-def asked(views: list[View]) -> Memory:
-    memory = Memory()
+def asked(views: list[View]) -> MeasurementCache:
+    memory = MeasurementCache()
     memory.next_map()
-    assert memory.recall(PIPE, True, [FAR], views) == (False, None)
-    memory.keep(PIPE, True, [FAR], views, None)
+    assert memory.recall(Question.of(PIPE, True, [FAR], views)) == (False, None)
+    memory.keep(Question.of(PIPE, True, [FAR], views), None)
     memory.next_map()
     return memory
 
 
 def test_an_answer_stands_while_nothing_near_has_changed(pipe_views: list[View]) -> None:
     nearly = dataclasses.replace(PIPE, start=PIPE.start + 1e-3)
-    assert asked(pipe_views).recall(nearly, True, [], shifted(pipe_views, 1e-5, 0)) == (True, None)
+    assert asked(pipe_views).recall(Question.of(nearly, True, [], shifted(pipe_views, 1e-5, 0))) == (True, None)
     memory = asked(pipe_views)
-    memory.recall(PIPE, True, [], pipe_views)
+    memory.recall(Question.of(PIPE, True, [], pipe_views))
     memory.next_map()
-    assert memory.recall(PIPE, True, [], pipe_views)[0]
+    assert memory.recall(Question.of(PIPE, True, [], pipe_views))[0]
     memory.next_map()
     memory.next_map()
-    assert not memory.recall(PIPE, True, [], pipe_views)[0]
+    assert not memory.recall(Question.of(PIPE, True, [], pipe_views))[0]
 
 
 def test_it_falls_with_a_pose_a_view_a_neighbour_or_the_candidate(pipe_views: list[View]) -> None:
     memory = asked(pipe_views)
     beside = Cylinder(PIPE.start + np.array([0.15, 0.0, 0.0]), PIPE.end + np.array([0.15, 0.0, 0.0]), 0.04)
-    assert not memory.recall(PIPE, True, [], shifted(pipe_views, 2e-3, 3))[0]
-    assert not memory.recall(PIPE, True, [], pipe_views[1:])[0]
-    assert not memory.recall(PIPE, True, [beside], pipe_views)[0]
-    assert not memory.recall(PIPE, False, [], pipe_views)[0]
-    assert not memory.recall(dataclasses.replace(PIPE, radius=0.044), True, [], pipe_views)[0]
+    assert not memory.recall(Question.of(PIPE, True, [], shifted(pipe_views, 2e-3, 3)))[0]
+    assert not memory.recall(Question.of(PIPE, True, [], pipe_views[1:]))[0]
+    assert not memory.recall(Question.of(PIPE, True, [beside], pipe_views))[0]
+    assert not memory.recall(Question.of(PIPE, False, [], pipe_views))[0]
+    assert not memory.recall(Question.of(dataclasses.replace(PIPE, radius=0.044), True, [], pipe_views))[0]
 
 
 def test_keyframes_are_decoded_once_within_memory() -> None:

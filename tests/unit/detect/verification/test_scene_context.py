@@ -8,7 +8,7 @@ import pytest
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.types import Cylinder
-from pipeprog_detect.verification.scene_context import Surroundings
+from pipeprog_detect.verification.scene_context import SceneContext
 
 SIGMA = 5e-4
 SPACING = 0.01
@@ -29,9 +29,9 @@ BACK = wall([-0.5, 0.0, 0.0], [0.5, 0.0, 1.0])
 SIDE = wall([-0.5, -1.0, 0.0], [-0.5, 0.0, 1.0])
 
 
-def surroundings(*walls: FloatArray) -> Surroundings:
+def surroundings(*walls: FloatArray) -> SceneContext:
     points = octree.build(np.concatenate([np.array([[9.0, 9.0, 9.0]]), *walls]))
-    return Surroundings(points, None, [], points, SIGMA)
+    return SceneContext(points, None, [], points, SIGMA)
 
 
 def upright(x: float, y: float, radius: float = RADIUS, low: float = 0.1, high: float = 0.9) -> Cylinder:
@@ -40,39 +40,39 @@ def upright(x: float, y: float, radius: float = RADIUS, low: float = 0.1, high: 
 
 @pytest.mark.parametrize("radius", [0.0086, 0.0365, 0.11])
 def test_a_pipe_that_touches_the_wall_is_not_buried(radius: float) -> None:
-    assert not surroundings(BACK).bury(upright(0.0, -radius, radius), 1e-4, AWAY)
+    assert not surroundings(BACK).is_embedded(upright(0.0, -radius, radius), 1e-4, AWAY)
 
 
 def test_a_pipe_whose_axis_lies_behind_the_wall_is_buried() -> None:
-    assert surroundings(BACK).bury(upright(0.0, 0.006), 1e-4, AWAY)
+    assert surroundings(BACK).is_embedded(upright(0.0, 0.006), 1e-4, AWAY)
 
 
 def test_a_radius_that_is_not_known_may_have_led_the_axis_behind_the_wall() -> None:
-    assert not surroundings(BACK).bury(upright(0.0, 0.006), 4e-3, AWAY)
+    assert not surroundings(BACK).is_embedded(upright(0.0, 0.006), 4e-3, AWAY)
 
 
 def test_a_pipe_half_in_the_wall_is_buried_and_one_on_it_is_not() -> None:
-    assert surroundings(BACK).bury(upright(0.0, 0.0), 1e-4, AWAY)
-    assert not surroundings(BACK).bury(upright(0.0, -RADIUS), 1e-4, AWAY)
+    assert surroundings(BACK).is_embedded(upright(0.0, 0.0), 1e-4, AWAY)
+    assert not surroundings(BACK).is_embedded(upright(0.0, -RADIUS), 1e-4, AWAY)
 
 
 def test_the_line_where_two_walls_meet_is_buried_and_a_pipe_before_it_is_not() -> None:
     corner = surroundings(BACK, SIDE)
     aslant = np.array([-0.3, 1.0, 0.0])
-    assert corner.bury(upright(-0.507, 0.006), 1e-4, aslant)
-    assert not corner.bury(upright(-0.5 + RADIUS, -RADIUS), 1e-4, aslant)
+    assert corner.is_embedded(upright(-0.507, 0.006), 1e-4, aslant)
+    assert not corner.is_embedded(upright(-0.5 + RADIUS, -RADIUS), 1e-4, aslant)
 
 
 def test_a_wall_on_one_side_hides_one_outline_only() -> None:
     beside = wall([0.01, -0.2, 0.0], [0.5, -0.2, 1.0])
-    assert not surroundings(beside).bury(upright(-0.01, 0.0), 1e-4, AWAY)
+    assert not surroundings(beside).is_embedded(upright(-0.01, 0.0), 1e-4, AWAY)
 
 
 def test_a_pipe_that_leaves_the_wall_for_most_of_its_length_stands() -> None:
     low, high = wall([-0.5, -0.02, 0.0], [0.5, -0.02, 0.41]), wall([-0.5, 0.0, 0.41], [0.5, 0.0, 1.0])
-    assert not surroundings(low, high).bury(upright(0.0, -RADIUS), 1e-4, AWAY)
-    assert surroundings(low, high).bury(upright(0.0, -RADIUS, high=0.6), 1e-4, AWAY)
+    assert not surroundings(low, high).is_embedded(upright(0.0, -RADIUS), 1e-4, AWAY)
+    assert surroundings(low, high).is_embedded(upright(0.0, -RADIUS, high=0.6), 1e-4, AWAY)
 
 
 def test_without_walls_nothing_is_buried() -> None:
-    assert not surroundings().bury(upright(0.0, 0.0), 1e-4, AWAY)
+    assert not surroundings().is_embedded(upright(0.0, 0.0), 1e-4, AWAY)

@@ -5,22 +5,29 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
-from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.wall_ends import abutted
+from pipeprog_detect.verification.scene_context import SceneContext
+from pipeprog_detect.verification.wall_ends import with_ends_on_walls
 from tests.unit.detect.pipe_and_wall import PIPE
 
 NO_RIMS = (0.0, 0.0)
 TOLERANCE = 1e-3
 
 
-def floor(height: float, x_from: float = -0.6, y_from: float = -0.6) -> tuple[list[Plane], Octree]:
+def walls(plane: Plane, points: FloatArray) -> SceneContext:
+    """A scene with one plane and its points (N, 3)."""
+    tree = octree.build(points)
+    return SceneContext(tree, None, [plane], tree, 1e-3)
+
+
+def floor(height: float, x_from: float = -0.6, y_from: float = -0.6) -> SceneContext:
     """The plane z = height and its points, 1 cm apart."""
     x, y = np.meshgrid(np.arange(x_from, x_from + 1.21, 0.01), np.arange(y_from, y_from + 1.21, 0.01))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
-    return [Plane(np.array([0.0, 0.0, 1.0]), height, 1.44)], octree.build(points)
+    return walls(Plane(np.array([0.0, 0.0, 1.0]), height, 1.44), points)
 
 
 def hiding(low: float, high: float) -> list[Cylinder]:
@@ -41,40 +48,41 @@ def height_of_start(cylinder: Cylinder) -> float:
 
 def test_a_pipe_that_the_views_show_to_end_above_the_floor_ends_there(pipe_views: list[View]) -> None:
     for height in (-0.23, -0.3):
-        same = abutted(PIPE, NO_RIMS, *floor(height), pipe_views, [])
+        same = with_ends_on_walls(PIPE, NO_RIMS, floor(height), pipe_views, [])
         assert height_of_start(same) == pytest.approx(PIPE.start[2], abs=1e-9)
         assert same.length == pytest.approx(PIPE.length, abs=1e-9)
 
 
 def test_a_pipe_of_which_the_lower_part_was_not_found_goes_on_to_the_floor(pipe_views: list[View]) -> None:
-    longer = abutted(cut(0.1), NO_RIMS, *floor(-0.2), pipe_views, [])
+    longer = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.2), pipe_views, [])
     assert height_of_start(longer) == pytest.approx(-0.2, abs=TOLERANCE)
     np.testing.assert_allclose(longer.end, PIPE.end)
 
 
 def test_what_is_hidden_goes_on_to_a_floor_that_is_near(pipe_views: list[View]) -> None:
     hides = hiding(-0.4, -0.06)
-    near = abutted(cut(0.1), NO_RIMS, *floor(-0.25), pipe_views, hides)
+    near = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.25), pipe_views, hides)
     assert height_of_start(near) == pytest.approx(-0.25, abs=TOLERANCE)
-    with_rim = abutted(cut(0.1), (10.0, 0.0), *floor(-0.25), pipe_views, hides)
+    with_rim = with_ends_on_walls(cut(0.1), (10.0, 0.0), floor(-0.25), pipe_views, hides)
     assert height_of_start(with_rim) == pytest.approx(-0.1, abs=TOLERANCE)
-    far = abutted(cut(0.1), NO_RIMS, *floor(-0.1 - 0.3 * np.log(2.0) - 0.01), pipe_views, hides)
+    far = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.1 - 0.3 * np.log(2.0) - 0.01), pipe_views, hides)
     assert height_of_start(far) == pytest.approx(-0.1, abs=TOLERANCE)
 
 
 def test_nothing_goes_on_to_a_plane_that_is_not_there_or_runs_along(pipe_views: list[View]) -> None:
     hides = hiding(-0.4, -0.06)
-    elsewhere = abutted(cut(0.1), NO_RIMS, *floor(-0.25, x_from=1.0), pipe_views, hides)
+    elsewhere = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.25, x_from=1.0), pipe_views, hides)
     assert elsewhere.length == pytest.approx(cut(0.1).length, abs=1e-9)
     x, z = np.meshgrid(np.arange(-0.6, 0.61, 0.01), np.arange(-0.6, 0.61, 0.01))
-    wall = octree.build(np.stack([x.ravel(), np.full(x.size, 0.05), z.ravel()], axis=1))
-    along = abutted(PIPE, NO_RIMS, [Plane(np.array([0.0, 1.0, 0.0]), 0.05, 1.44)], wall, pipe_views, [])
+    points = np.stack([x.ravel(), np.full(x.size, 0.05), z.ravel()], axis=1)
+    wall = walls(Plane(np.array([0.0, 1.0, 0.0]), 0.05, 1.44), points)
+    along = with_ends_on_walls(PIPE, NO_RIMS, wall, pipe_views, [])
     assert along.length == pytest.approx(PIPE.length, abs=1e-9)
 
 
 def test_what_lies_under_the_floor_is_cut_off(pipe_views: list[View]) -> None:
     deeper = Cylinder(PIPE.start - 0.08 * PIPE.axis, PIPE.end, PIPE.radius)
-    whole = abutted(deeper, (10.0, 10.0), *floor(-0.2), pipe_views, [])
+    whole = with_ends_on_walls(deeper, (10.0, 10.0), floor(-0.2), pipe_views, [])
     assert height_of_start(whole) == pytest.approx(-0.2, abs=TOLERANCE)
 
 
@@ -84,10 +92,10 @@ def test_a_pipe_through_a_shelf_with_a_view_from_below_is_not_cut(pipe_views: li
     pose = pipe_views[0].camera_from_map.copy()
     pose[:3, 3] = -pose[:3, :3] @ below
     view = View(99, pipe_views[0].image, pipe_views[0].camera, pose)
-    same = abutted(PIPE, NO_RIMS, *floor(-0.15), [*pipe_views, view], [])
+    same = with_ends_on_walls(PIPE, NO_RIMS, floor(-0.15), [*pipe_views, view], [])
     assert height_of_start(same) == pytest.approx(PIPE.start[2], abs=1e-9)
 
 
 def test_a_pipe_beside_an_edge_of_the_floor_is_not_cut(pipe_views: list[View]) -> None:
-    same = abutted(PIPE, NO_RIMS, *floor(-0.15, y_from=0.06), pipe_views, [])
+    same = with_ends_on_walls(PIPE, NO_RIMS, floor(-0.15, y_from=0.06), pipe_views, [])
     assert height_of_start(same) == pytest.approx(PIPE.start[2], abs=1e-9)

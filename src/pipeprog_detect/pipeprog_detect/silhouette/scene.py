@@ -1,0 +1,173 @@
+"""A scene: the views of one cylinder and what may hide it; samples its apparent contour and finds limb edges there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.silhouette.apparent_contour import (
+    ContourSamples,
+    contour_samples,
+    frame,
+    moved,
+    viewing_direction,
+)
+from pipeprog_detect.silhouette.limb_edges import (
+    INWARD,
+    LINEAR_LIGHT,
+    WINDOW_OF_HALF_WIDTH,
+    LimbEdges,
+    limb_cost,
+    limb_edges,
+    smooth_cost,
+)
+from pipeprog_detect.silhouette.occlusion import visible
+from pipeprog_detect.types import Cylinder, View
+
+# Length of contour [px] that makes one measurement: the mean over it averages texture, the line stays straight within.
+SPACING = 12
+# Outside the pipe the limb model's window ends where the next thing may begin: this far [px], and so many blurs.
+OUTWARD, OUTWARD_OF_BLUR = 1.5, 3.0
+# Blur of a sharp image, lens and pixel together, and the ones that are tried [px].
+SHARP = 0.5
+BLURS = np.array([0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.5])
+# The blur is measured within this distance of the predicted contour [px], on about this many samples.
+BLUR_REACH, BLUR_SAMPLES = 0.8, 600
+# A sample shows a clear edge where the limb model leaves less than this share of what a smooth profile leaves; so many
+# such samples measure one line's blur, and so many lines the images'.
+CLEAR, LEAST_CLEAR, LEAST_LINES = 0.4, 4, 3
+# Surfaces only soften an edge: of all lines' blurs the lowest tenth is that of the images.
+SHARPEST = 0.1
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The views of one cylinder, what may hide it, and what is known of the views.
+
+    Attributes:
+        views: V keyframes.
+        others: further cylinders, which may hide this one.
+        basis: (2, 3) unit vectors across the cylinder's axis: sideways as the views see it, and away from them.
+        view_offset: (V,) shift of the whole pipe in each view towards side 0, which an error of its pose makes [px].
+        blur: of the images [px].
+    """
+
+    views: Sequence[View]
+    others: Sequence[Cylinder]
+    basis: FloatArray
+    view_offset: FloatArray
+    blur: float = SHARP
+
+    @classmethod
+    def of(cls, cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> Scene:
+        """The scene of a cylinder before its contour is measured: sharp views with true poses."""
+        return cls(views, others, frame(cylinder, viewing_direction(cylinder, views)), np.zeros(len(views)))
+
+    def turned_to(self, cylinder: Cylinder) -> Scene:
+        """The scene with the basis of another cylinder."""
+        return replace(self, basis=frame(cylinder, viewing_direction(cylinder, self.views)))
+
+    def shifted(self, view_offset: FloatArray) -> Scene:
+        """The scene with other offsets (V,) of its views [px]."""
+        return replace(self, view_offset=view_offset)
+
+    def moved(self, cylinder: Cylinder, step: FloatArray) -> Cylinder:
+        """The cylinder after a step (5,) along the basis; see `apparent_contour.moved`."""
+        return moved(cylinder, self.basis, step)
+
+    def samples(self, cylinder: Cylinder, spacing: int = SPACING, margin: float = 4.0) -> ContourSamples:
+        """Samples of the cylinder's contour, about `spacing` [px] apart, that nothing hides."""
+        samples = contour_samples(cylinder, self.views, self.basis, spacing, margin)
+        return samples.select(visible(samples, cylinder, self.views, self.others))
+
+    def edges(
+        self, cylinder: Cylinder, reach: float, spacing: int = SPACING, limit: int | None = None
+    ) -> tuple[ContourSamples, LimbEdges]:
+        """Visible samples, about `limit` at the most, and the limb edges within `reach` [px] of them.
+
+        The edges' offsets are from the predicted contour; they are sought about where the views' offsets put it.
+        """
+        samples, offsets, values = self._profiles(cylinder, reach, spacing, limit)
+        edges = limb_edges(values, offsets, samples.half_width, self.blur, reach)
+        return samples, edges.shifted(self.shift_of(samples))
+
+    def shift_of(self, samples: ContourSamples) -> FloatArray:
+        """Outward displacement (N,) [px] of samples by their views' offsets."""
+        return samples.sideways() * self.view_offset[samples.view]
+
+    def light(self, samples: ContourSamples, offsets: FloatArray, lines: int) -> NDArray[np.float32]:
+        """Light (N, Q), 0 to 255, along the samples' normals at `offsets` (Q,) [px], the mean of `lines` parallels.
+
+        Samples outside the image repeat its border.
+        """
+        result = np.empty((len(samples), len(offsets)), np.float32)
+        for index, view in enumerate(self.views):
+            chosen = np.flatnonzero(samples.view == index)
+            if len(chosen):
+                result[chosen] = _light(view, samples.pixel[chosen], samples.normal[chosen], offsets, lines)
+        return result
+
+    def with_measured_blur(self, cylinder: Cylinder) -> Scene:
+        """The scene with the blur by which the limb model explains the cylinder's contour best."""
+        samples, offsets, values = replace(self, blur=1.0)._profiles(cylinder, BLUR_REACH, SPACING, BLUR_SAMPLES)
+        if not len(samples):
+            return replace(self, blur=SHARP)
+        trials = np.arange(-BLUR_REACH, BLUR_REACH + 0.1, 0.2, dtype=float)
+        left = [limb_cost(values, offsets, samples.half_width, float(blur), trials).min(axis=1) for blur in BLURS]
+        cost = np.log(np.stack(left) / smooth_cost(values, offsets, samples.half_width) + 1e-4)
+        clear = cost.min(axis=0) < np.log(CLEAR)
+        line = 2 * samples.view + samples.side
+        best = []
+        for one in np.unique(line[clear]):
+            members = clear & (line == one)
+            if members.sum() >= LEAST_CLEAR:
+                best.append(_lowest(np.log(BLURS), cost[:, members].sum(axis=1)))
+        blur = float(np.exp(np.quantile(best, SHARPEST))) if len(best) >= LEAST_LINES else SHARP
+        return replace(self, blur=blur)
+
+    def _profiles(
+        self, cylinder: Cylinder, reach: float, spacing: int, limit: int | None
+    ) -> tuple[ContourSamples, FloatArray, FloatArray]:
+        """Visible samples, offsets (Q,) [px] and light (N, Q) there, from where the views' offsets put the contour."""
+        samples = self.samples(cylinder, spacing, margin=INWARD)
+        if limit is not None:
+            samples = samples.thinned(limit)
+        inward = INWARD
+        if len(samples):
+            inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(samples.half_width)))
+        outward = OUTWARD + OUTWARD_OF_BLUR * self.blur
+        offsets = np.arange(-inward - reach, outward + 0.25, 0.5, dtype=float)
+        pixel = samples.pixel + self.shift_of(samples)[:, None] * samples.normal
+        values = self.light(replace(samples, pixel=pixel), offsets, spacing)
+        return samples, offsets, np.asarray(values, float)
+
+
+def _light(view: View, pixel: FloatArray, normal: FloatArray, offsets: FloatArray, lines: int) -> NDArray[np.float32]:
+    """Light (N, Q) of one view along normals (N, 2) through pixel (N, 2), the mean of parallels one pixel apart."""
+    shifts = np.arange(lines) - 0.5 * (lines - 1)
+    tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+    feet = (pixel[:, None] + shifts[None, :, None] * tangent[:, None]).reshape(-1, 2)
+    outward = np.repeat(normal, lines, axis=0)
+    size = np.array([view.camera.width, view.camera.height])
+    tips = np.stack([feet + offsets[0] * outward, feet + offsets[-1] * outward])
+    low = np.clip(np.floor(tips.min(axis=(0, 1))).astype(int) - 2, 0, size - 1)
+    high = np.clip(np.ceil(tips.max(axis=(0, 1))).astype(int) + 3, low + 1, size)
+    light = cv2.LUT(np.ascontiguousarray(view.image[low[1] : high[1], low[0] : high[0]]), LINEAR_LIGHT)
+    along = offsets.astype(np.float32)
+    x, y = (np.multiply.outer(outward[:, k].astype(np.float32), along) for k in (0, 1))
+    x += (feet[:, :1] - low[0]).astype(np.float32)
+    y += (feet[:, 1:] - low[1]).astype(np.float32)
+    sampled = cv2.remap(light, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled.reshape(len(pixel), lines, -1).mean(axis=1, dtype=np.float32))
+
+
+def _lowest(x: FloatArray, cost: FloatArray) -> float:
+    """Where the parabola through the least of cost (T,) at x (T,) and its neighbours is lowest."""
+    middle = int(np.clip(np.argmin(cost), 1, len(x) - 2))
+    square, slope, _ = np.polyfit(x[middle - 1 : middle + 2], cost[middle - 1 : middle + 2], 2)
+    return float(np.clip(-0.5 * slope / square, x[0], x[-1])) if square > 0 else float(x[np.argmin(cost)])

@@ -1,0 +1,136 @@
+"""A candidate's contour fits: from the cloud's cylinder, and with the radii that the bill of quantities plans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from pipeprog_detect.cloud.candidate import Candidate
+from pipeprog_detect.product.boq import BillOfQuantities
+from pipeprog_detect.product.classification import is_planned
+from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, refine
+from pipeprog_detect.silhouette.one_sided import SeenArc
+from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question
+
+# Support that makes a pipe: those that exist show edges along more than half of their visible contour.
+CONVINCING = 0.5
+# The windows in which edges are sought follow from the radius: where it changes by more than this share they are placed
+# anew, in so many rounds at most.
+SETTLED, MAX_ROUNDS = 0.1, 3
+# A planned radius within this share of one that is not planned is tried, and taken with this share of its support.
+NEAR_PLANNED, AS_GOOD = 0.15, 0.6
+# Planned radii are within reach of a candidate up to this many standard deviations.
+REACH = 3.0
+
+
+@dataclass(frozen=True)
+class CandidateFitter:
+    """Fits candidates to their contours in the keyframes; `boq` has the planned radii, `cache` the last map's fits."""
+
+    boq: BillOfQuantities
+    cache: MeasurementCache
+
+    def is_planned(self, fit: ContourFit) -> bool:
+        """Whether the fit has a radius of the bill of quantities, within its standard deviation."""
+        return is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
+
+    def fit(
+        self,
+        candidate: Candidate,
+        others: Sequence[Cylinder],
+        views: Sequence[View],
+        follow: bool = True,
+        trusted: bool = False,
+    ) -> ContourFit | None:
+        """The best supported fit from where the cloud has the candidate; None where the views show too little.
+
+        Args:
+            candidate: of the cloud.
+            others: further cylinders, which may hide it.
+            views: the keyframes.
+            follow: whether its ends are sought.
+            trusted: whether the cloud's surface may take the place of a side that others hide.
+        """
+        if not views:
+            return None
+        question = Question.of(candidate.cylinder, follow, others, views)
+        known, best = self.cache.recall(question)
+        if known:
+            return best
+        fits = [_settled(start, views, others, self._radii(), follow) for start in self._starts(candidate, trusted)]
+        best = max((fit for fit in fits if fit is not None), key=lambda fit: fit.support, default=None)
+        self.cache.keep(question, best)
+        return best
+
+    def near_planned(
+        self, fit: ContourFit | None, others: Sequence[Cylinder], views: Sequence[View]
+    ) -> ContourFit | None:
+        """The fit, or one of a planned radius near it whose contour is about as well supported.
+
+        A shadow along a pipe is taken for its contour where the cameras never rise or fall. Pipes of sizes that nobody
+        planned are rarer than shadows, but where the planned size finds no contour of its own the fit stands.
+        """
+        if fit is None or self.is_planned(fit):
+            return fit
+        radius = fit.cylinder.radius
+        for planned in self._radii():
+            if abs(planned / radius - 1.0) < NEAR_PLANNED:
+                again = _at_radius(fit.cylinder, planned, abs(planned - radius), views, others)
+                if again is not None and self.is_planned(again) and again.support > AS_GOOD * fit.support:
+                    return again
+        return fit
+
+    def of_planned_radius(
+        self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]
+    ) -> ContourFit | None:
+        """The best supported fit of a planned radius that the cloud of a blurred candidate allows; None without one.
+
+        Lines beside a thin pipe, such as its shadow's, are taken for its contour where its radius is left open.
+        """
+        if not candidate.blurred:
+            return None
+        noise, cylinder = candidate.evidence.noise, candidate.cylinder
+        near = [planned for planned in self._radii() if abs(planned - cylinder.radius) < REACH * _sigma(candidate)]
+        fits = [_at_radius(cylinder, planned, noise, views, others) for planned in near]
+        good = [fit for fit in fits if fit is not None and fit.support > CONVINCING and self.is_planned(fit)]
+        return max(good, key=lambda fit: fit.support, default=None)
+
+    def _radii(self) -> list[float]:
+        return [planned.outer_radius for planned in self.boq.classes]
+
+    def _starts(self, candidate: Candidate, trusted: bool) -> list[Start]:
+        """Where the contour is sought: at the candidate's radius, and at planned ones if the cloud leaves it open."""
+        sigma, cylinder = _sigma(candidate), candidate.cylinder
+        seen = SeenArc(candidate.evidence.arc, sigma) if trusted and not candidate.blurred else None
+        radii = [cylinder.radius]
+        if candidate.blurred:
+            radii += [radius for radius in self._radii() if abs(radius - cylinder.radius) < REACH * sigma]
+        return [Start(replace(cylinder, radius=radius), sigma, ends_known=True, seen=seen) for radius in radii]
+
+
+def _settled(
+    start: Start, views: Sequence[View], others: Sequence[Cylinder], radii: Sequence[float], follow: bool
+) -> ContourFit | None:
+    """The fit of a start, from windows that are those of its own radius."""
+    given = start.cylinder
+    fit = None
+    for _ in range(MAX_ROUNDS):
+        fit = refine(start, views, others, radii, follow)
+        if fit is None or abs(fit.cylinder.radius / start.cylinder.radius - 1.0) < SETTLED:
+            break
+        start = replace(start, cylinder=fit.cylinder.cut_like(given))
+    return fit
+
+
+def _at_radius(
+    cylinder: Cylinder, radius: float, radius_sigma: float, views: Sequence[View], others: Sequence[Cylinder]
+) -> ContourFit | None:
+    """The fit of a cylinder with another radius, which is taken as known."""
+    start = Start(replace(cylinder, radius=radius), radius_sigma, radius_known=True, ends_known=True)
+    return refine(start, views, others)
+
+
+def _sigma(candidate: Candidate) -> float:
+    """Standard deviation of the surface [m]: it may lie as far from its points' mean as these scatter."""
+    return max(candidate.radius_sigma, candidate.evidence.noise)

@@ -1,0 +1,44 @@
+"""Whether the radius that the cloud shows and the one that the keyframes show can be those of one pipe."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeprog_detect.cloud.candidate import Candidate
+from pipeprog_detect.silhouette.contour_refinement import ContourFit
+
+# They contradict each other where they differ by more than this many standard deviations, the cloud's noise included,
+# and agree where they differ by less than this many without it (one in twenty pipes is beyond that).
+CONTRADICTION, AGREEMENT = 4.0, 2.0
+# The cloud resolves a section of five times its noise, seen along a third of the way around [rad], whose radius it
+# knows to a twentieth: the edge of a box is round, too, to a cloud. Two faces lie a tenth of the radius off the circle
+# along both: a section of thirty times the noise shows that, and is round wherever it is seen.
+RESOLVED_RADII, RESOLVED_ARC, RESOLVED_SIGMA = 5.0, np.radians(120.0), 0.05
+ROUND_RADII = 30.0
+
+
+def is_resolved(candidate: Candidate) -> bool:
+    """Whether the cloud alone tells the candidate's section from the edge of a box."""
+    evidence, radius = candidate.evidence, candidate.cylinder.radius
+    if candidate.radius_sigma > RESOLVED_SIGMA * radius:
+        return False
+    return radius > ROUND_RADII * evidence.noise or (
+        radius > RESOLVED_RADII * evidence.noise and evidence.arc > RESOLVED_ARC
+    )
+
+
+def agree(candidate: Candidate, fit: ContourFit) -> bool:
+    """Whether a cloud that resolves the section has the radius of the contour."""
+    sigma = np.hypot(candidate.radius_sigma, fit.radius_sigma)
+    difference = abs(fit.cylinder.radius - candidate.cylinder.radius)
+    return is_resolved(candidate) and bool(difference < AGREEMENT * sigma)
+
+
+def contradict(candidate: Candidate, fit: ContourFit) -> bool:
+    """Whether a cloud that resolves the section cannot have the radius of the contour.
+
+    Where the cameras never rise or fall, the edge of the light along a pipe is taken for its contour.
+    """
+    sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, fit.radius_sigma])
+    difference = abs(fit.cylinder.radius - candidate.cylinder.radius)
+    return is_resolved(candidate) and bool(difference > CONTRADICTION * sigma)
