@@ -61,7 +61,11 @@ accuracy: setup ## accuracy against ground truth (slower than the tests)
 experiments: setup ## the paper's four experiments
 	@$(BIN)/python -m benchmarks.experiments
 
+docs: setup ## pages of all modules, from their docstrings, in out/docs
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.txt
+	@$(BIN)/python -m pdoc --docformat google --no-show-source --output-directory out/docs $(filter pipeprog pipeprog_%,$(filter-out %_msgs,$(notdir $(wildcard src/*))))
+
 clean: ## remove what was built, the environment included
 	@rm -rf $(VENV) build install log out
 
-.PHONY: help setup demo test lint accuracy experiments clean
+.PHONY: help setup demo test lint accuracy experiments docs clean

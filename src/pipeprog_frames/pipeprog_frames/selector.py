@@ -22,7 +22,7 @@ MAX_UNSEEN = 200_000_000  # ns between two looks: a turn of 90 degrees a second 
 LOADED_OVERLAP = 0.6  # below, neighbours alone no longer cover an image twice, which a point of the map takes
 LOADED_PARALLAX = 3.0  # times the usual one
 
-Load = Callable[[], "GrayImage | None"]
+Load = Callable[[], GrayImage | None]
 
 
 @dataclass(frozen=True)
