@@ -90,7 +90,7 @@ def commands(text: str) -> list[list[str]]:
     """Arguments of each `pipeprog` command line; a word of capitals with a comment behind it ends there."""
     found = []
     for code in in_code(text):
-        match = re.match(r"(?:\.venv/bin/)?pipeprog\s+(.+)", code.split("  #")[0])
+        match = re.match(r"(?:\$ )?(?:\.venv/bin/)?pipeprog\s+(.+)", code.split("  #")[0])
         if match:
             found.append(shlex.split(OPTIONAL.sub("", match.group(1))))
     return found
@@ -147,6 +147,14 @@ def test_settings_that_are_named_exist(path: Path) -> None:
     }
     named = [re.match(r"(?:--set )?((?:frames|sfm|detect)\.(?!csv)[\w.]+)", code) for code in in_code(path.read_text())]
     assert [match.group(1) for match in named if match and match.group(1) not in known] == []
+
+
+def test_every_package_and_room_is_in_the_architecture() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    packages = [path.parent for path in (ROOT / "src").glob("*/package.xml")]
+    rooms = [path.parent for package in packages for path in package.glob(f"{package.name}/*/__init__.py")]
+    named = [f"| `{package.name}` |" for package in packages] + [f"`{room.name}/`" for room in rooms]
+    assert [name for name in named if name not in text] == []
 
 
 def test_what_is_not_there_is_noticed() -> None:
