@@ -110,6 +110,18 @@ def test_several_surveys_become_a_series_in_the_order_of_their_dates(tmp_path: P
     assert page.count("<svg") == 3
 
 
+def test_classes_by_posterior_are_set_against_those_by_kmeans(tmp_path: Path) -> None:
+    folder = survey(tmp_path / "run", name="<b>")
+    content = json.loads((folder / "pipes.json").read_text())
+    for pipe in content["pipes"]:
+        pipe["class_kmeans"] = "<b>"
+    (folder / "pipes.json").write_text(json.dumps(content))
+    page, _ = read(report([folder], tmp_path / "report.html", False, silent))
+    table = re.sub(r">\s+<", "><", page[page.index("Class by posterior") :])
+    assert "<th></th><th>&lt;b&gt;</th>" in table
+    assert "<td>&lt;b&gt;</td><td>1</td></tr><tr><td>no planned class</td><td>1</td></tr>" in table
+
+
 def test_a_run_with_pipes_json_alone(tmp_path: Path) -> None:
     folder = survey(tmp_path / "run")
     for name in ("cloud.ply", "trajectory.tum", "config.yaml", "run.json"):
