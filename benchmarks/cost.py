@@ -64,7 +64,7 @@ def main() -> None:
 
 
 def _measured(millions: float) -> dict[str, Any]:
-    """CPU seconds of each stage on a scan with about so many million points, and the process's peak memory."""
+    """CPU seconds of each stage on a scan of about `millions` million points, and the process's peak memory."""
     build, _, distance = LAYOUTS["field"]
     site = build(np.random.default_rng(SEED), 1.0, 0.0, distance)
     radii = site.planned_radii
