@@ -177,9 +177,10 @@ def _page(page: Page, results: Mapping[str, Result]) -> str:
 
 
 def _section(result: Result, page: Page, name: str) -> list[str]:
-    """One result: its title where the page's heading says something else, findings, table, and what gave no result."""
-    title = result.get("title")
-    parts = [f"## {title}\n"] * bool(title and title != page.heading)
+    """One result: its title where page.note does not say it, findings, table, and what gave no result."""
+    title = result.get("title", page.heading)
+    said = title == page.heading or (len(page.results) == 1 and bool(page.note))
+    parts = [] if said else [f"## {title}\n"]
     findings = result.get("findings") or result.get("summary")
     if findings:
         parts.append(bullets(f"{what.replace('_', ' ')}: {value}" for what, value in findings.items()))

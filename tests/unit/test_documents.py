@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import re
 import shlex
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 import typer
 
 from pipeprog_bringup.cli import app
 from pipeprog_bringup.results.overrides import effective
+from pipeprog_bringup.results.result_files import FRAME_COLUMNS
+from pipeprog_bringup.results.scoring import Result, Segment, Truth, score
 from pipeprog_camera.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -155,6 +159,30 @@ def test_every_package_and_room_is_in_the_architecture() -> None:
     rooms = [path.parent for package in packages for path in package.glob(f"{package.name}/*/__init__.py")]
     named = [f"| `{package.name}` |" for package in packages] + [f"`{room.name}/`" for room in rooms]
     assert [name for name in named if name not in text] == []
+
+
+def properties(schema: object) -> set[str]:
+    """Names of the fields that a JSON schema describes, at all levels."""
+    if isinstance(schema, list):
+        return set().union(*map(properties, schema))
+    if not isinstance(schema, dict):
+        return set()
+    own = set(schema["properties"]) if "required" in schema else set()
+    return own.union(*map(properties, schema.values()))
+
+
+def keys(content: object) -> set[str]:
+    if isinstance(content, list):
+        return set().union(*map(keys, content))
+    return set(content).union(*map(keys, content.values())) if isinstance(content, dict) else set()
+
+
+def test_every_field_of_the_results_is_described() -> None:
+    pipe = Segment(np.zeros(3), np.ones(3), 0.05, 1.7, "p01", "DN100")
+    figures = score(Result((pipe,), {"DN100": 0.05}), Truth((pipe,), (), np.zeros((0, 4, 4))))
+    fields = properties(json.loads((ROOT / "docs" / "pipes.schema.json").read_text())) | keys(figures)
+    told = set(re.findall(r"\w+", " ".join(in_code((ROOT / "docs" / "files.md").read_text()))))
+    assert {*fields, *FRAME_COLUMNS} - told == set()
 
 
 def test_what_is_not_there_is_noticed() -> None:
