@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.candidate_search import THICKEST_LINE, Report, Search, is_pipe
+from pipeprog_detect.candidate_search import Report, Search
 from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
+from pipeprog_detect.cloud.acceptance import THICKEST_LINE, seen_from_inside, seen_from_outside
+from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.cloud.cutting_planes import parse_planes
+from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.interior_search import find_concave
 from pipeprog_detect.product import classification
@@ -27,10 +30,34 @@ from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import with_ends_on_walls
 
-# Stereo is rougher on pipes, curved and glossy, than on the walls that the noise is read from.
+# Stereo is twice as rough on pipes, curved and glossy, as on the walls that the noise is read from.
 _STEREO_ON_PIPES = 2.0
-# Of the walls points so far apart [m] suffice to tell where they are.
+# Points of walls are thinned to cells of this size [m]: they tell where the wall is, not how rough.
 _WALL_SPACING = 0.01
+# Pipes up to 1.5 times as thick as the thickest planned one are looked for: a wrong size on site is to be seen.
+_THICKEST = 1.5
+# A camera in a sewer may be in a pipe that is thinner than planned, too, by up to 30 %.
+_THINNEST_BORE = 0.7
+
+
+@dataclass(frozen=True)
+class PreparedCloud:
+    """A cloud whose planes are known, in a frame near it.
+
+    Attributes:
+        shift: origin (3,) of the frame in the cloud's own one [m]: far from the origin (UTM) doubles still hold
+            micrometres, squares of them do not.
+        points: all points with finite coordinates (N, 3) [m].
+        tree: those on no plane.
+        around: walls and free space, with the normals of the tree's points.
+        sigma: standard deviation of the points across surfaces [m].
+    """
+
+    shift: FloatArray
+    points: FloatArray
+    tree: Octree
+    around: SceneContext
+    sigma: float
 
 
 def detect(
@@ -41,20 +68,38 @@ def detect(
     progress: Report | None = None,
     memory: MeasurementCache | None = None,
 ) -> list[Pipe]:
-    """Find, measure and classify the pipes of a metric cloud.
+    """The pipes of a metric cloud: found, measured and classified, in the cloud's frame, sorted by place.
 
-    Points that are not finite are dropped; a cloud without any others raises InputError. `progress` is called with
-    the share done (0..1) and what is being done. With the `memory` of the last map what has not changed is not
-    measured again.
+    Args:
+        cloud: points that are not finite are left out.
+        boq: the planned classes.
+        config: the settings.
+        views: keyframes of the same frame; candidates are verified and measured in them.
+        progress: called with the share done (0..1) and what is being done.
+        memory: what is known from the last map of this survey: what has not changed is not measured again. It is
+            brought up to this map.
+
+    Raises:
+        InputError: no point is finite, or the points are no N x 3 array.
     """
     report = progress or _silent
+    prepared = _prepare(cloud, _THICKEST * max(planned.outer_radius for planned in boq.classes), report)
+    if config.concave:
+        measured = detect_inside(prepared, boq, config, report)
+    else:
+        measured = detect_outside(prepared, boq, config, views, report, memory)
+    report(1.0, "done")
+    return _product(measured, boq, prepared.shift, config)
+
+
+def _prepare(cloud: Cloud, widest: float, report: Report) -> PreparedCloud:
+    """The cloud sorted, with its noise and its planes, none of which is a strip of a pipe of radius `widest` [m]."""
     points = np.asarray(cloud.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"the cloud's points have the shape {points.shape}: give N x 3 metres")
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         raise InputError(f"the cloud holds no point with finite coordinates ({len(points)} in all): check its source")
-    # Far from the origin (UTM) doubles still hold micrometres, squares of them do not.
     points = points[finite]
     shift = np.round(np.median(points, axis=0))
     points = points - shift
@@ -62,45 +107,80 @@ def detect(
     tree = octree.build(points)
     report(0.1, "estimating noise")
     sigma = local_shape.estimate_noise(tree)
-    widest = 1.5 * max(planned.outer_radius for planned in boq.classes)
     report(0.15, "finding walls")
     walls, on_plane = plane_segmentation.find_planes(tree, sigma, widest)
     plain = tree.subset(on_plane)
     plain = plain.thinned(plain.level_of(_WALL_SPACING))
     tree = tree.subset(~on_plane)
     outward = None if cloud.normals is None else np.asarray(cloud.normals, float)[finite][tree.order]
-    around = SceneContext(tree, outward, walls, plain, sigma)
-    if config.concave:
-        report(0.3, "looking for pipes seen from inside")
-        bores = [radius for planned in boq.classes for radius, _ in planned.bores]
-        seen = find_concave(tree, around, sigma, (0.7 * min(bores), 1.5 * max(bores)), config)
-        return _product([MeasuredPipe(each, each.cylinder, each.radius_sigma) for each in seen], boq, shift, config)
-    planned_radii = [planned.outer_radius for planned in boq.classes]
+    return PreparedCloud(shift, points, tree, SceneContext(tree, outward, walls, plain, sigma), sigma)
+
+
+def detect_inside(
+    prepared: PreparedCloud, boq: BillOfQuantities, config: DetectConfig, report: Report
+) -> list[MeasuredPipe]:
+    """The pipes that a camera within them sees: the cloud alone is judged."""
+    report(0.3, "looking for pipes seen from inside")
+    bores = [radius for planned in boq.classes for radius, _ in planned.bores]
+    radius_range = (_THINNEST_BORE * min(bores), _THICKEST * max(bores))
+    criteria = seen_from_inside(prepared.sigma, config)
+    found = find_concave(prepared.tree, prepared.around, criteria, radius_range, config.seed)
+    return [MeasuredPipe(each, each.cylinder, each.radius_sigma) for each in found]
+
+
+def detect_outside(
+    prepared: PreparedCloud,
+    boq: BillOfQuantities,
+    config: DetectConfig,
+    views: Sequence[View],
+    report: Report,
+    memory: MeasurementCache | None,
+) -> list[MeasuredPipe]:
+    """The pipes of a room: candidates of the cloud, verified and measured in the views, and thin ones of the views."""
+    shift, around = prepared.shift, prepared.around
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
-    judging = with_depths(local_views, points) if config.contour.enabled else []
+    judging = with_depths(local_views, prepared.points) if config.contour.enabled else []
     verifier = KeyframeVerifier(judging, boq, memory)
-    # A cloud with normals towards cameras is stereo's, too.
-    noise = _STEREO_ON_PIPES * sigma if verifier.has_views or outward is not None else sigma
-    radius_range = (config.radius_min, widest)
-    planes = [replace(plane, point=plane.point - shift) for plane in parse_planes(config.plane)] if config.plane else []
-    fresh = memory.novelty.of(points + shift)[tree.order] if memory else np.ones(len(tree.points), bool)
-    known = [cylinder.shifted(-shift) for cylinder in memory.novelty.known] if memory else []
-    search = Search(tree, around, noise, radius_range, planned_radii, config, verifier, report)
-    candidates = search.candidates(fresh, known, planes)
-    if memory:
-        memory.novelty.known = [candidate.cylinder.shifted(shift) for candidate in candidates]
+    candidates = _candidates(prepared, boq, config, verifier, report, memory)
     report(0.9, "measuring in the keyframes" if views else "measuring")
-    measured = verifier.measure(
-        candidates, [is_pipe(each, sigma if verifier.has_views else noise, config) for each in candidates]
-    )
+    # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
+    criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
+    measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
     measured = _genuine(measured, around, judging)
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
-    lost = find_thin_pipes(points, THICKEST_LINE, measured, judging, boq, edges)
+    lost = find_thin_pipes(prepared.points, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
-    measured = _abutted(joined(measured), around, judging)
-    report(1.0, "done")
-    return _product(measured, boq, shift, config)
+    return _abutted(joined(measured), around, judging)
+
+
+def _candidates(
+    prepared: PreparedCloud,
+    boq: BillOfQuantities,
+    config: DetectConfig,
+    verifier: KeyframeVerifier,
+    report: Report,
+    memory: MeasurementCache | None,
+) -> list[Candidate]:
+    """The candidates of the cloud; of a map that follows another one, those of the last map and of what is new."""
+    tree, shift = prepared.tree, prepared.shift
+    planned = [each.outer_radius for each in boq.classes]
+    radius_range = (config.radius_min, _THICKEST * max(planned))
+    criteria = seen_from_outside(_noise_on_pipes(prepared, verifier), config)
+    search = Search(tree, prepared.around, criteria, radius_range, planned, config, verifier, report)
+    planes = [replace(plane, point=plane.point - shift) for plane in parse_planes(config.plane)] if config.plane else []
+    if memory is None:
+        return search.candidates(np.ones(len(tree.points), bool), [], planes)
+    fresh = memory.novelty.fresh(prepared.points + shift)[tree.order]
+    candidates = search.candidates(fresh, [cylinder.shifted(-shift) for cylinder in memory.novelty.known], planes)
+    memory.novelty.remember([candidate.cylinder.shifted(shift) for candidate in candidates])
+    return candidates
+
+
+def _noise_on_pipes(prepared: PreparedCloud, verifier: KeyframeVerifier) -> float:
+    """Standard deviation [m] of the points on pipes; a cloud with keyframes, or with normals, is one of stereo."""
+    stereo = verifier.has_views or prepared.around.outward is not None
+    return _STEREO_ON_PIPES * prepared.sigma if stereo else prepared.sigma
 
 
 def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:

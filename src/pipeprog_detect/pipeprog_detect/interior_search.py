@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import local_shape
+from pipeprog_detect.cloud.acceptance import AcceptanceCriteria
 from pipeprog_detect.cloud.candidate import Candidate, refit
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.octree import Octree
-from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.scene_context import SceneContext
 
@@ -38,37 +38,34 @@ _ALIKE = 0.1
 # Normals at less than 25 deg to each other do not tell where they meet; those of one circle meet at equal distances.
 _LEAST_ANGLE = float(np.sin(np.radians(25.0)))
 _UNEQUAL = 0.15
-# A smaller arc is as well a bent piece of something else.
-_LEAST_ARC = np.radians(74.9)
-# Neither within the pipe nor beyond its wall is there much to see from inside.
-_STRAY = 0.15
+# Most points within the pipe or behind its wall, in points on the wall: from inside neither is seen.
+_INTRUSION_MAX = 0.15
 # Depth cameras are several times as rough at the far end of a pipe as at the near one.
 _ROUGHNESS = 2.0
-# The camera is a few radii away from what it sees best, and a depth camera's noise a hundredth of that at most.
-_ROUGHEST = 0.05
 
 
 def find_concave(
     tree: Octree,
     around: SceneContext,
-    sigma: float,
+    criteria: AcceptanceCriteria,
     radius_range: tuple[float, float],
-    config: DetectConfig,
+    seed: int,
 ) -> list[Candidate]:
     """Cylinders of the tree's points that are seen from inside, the best supported first.
 
-    Where the normals `around` are known they must point to the axis; sigma [m] is the noise.
+    Where the normals `around` are known they must point to the axis. The search takes random pairs of sites and random
+    steps, both by `seed`.
     """
     free = np.ones(len(tree.points), bool)
     found: list[Candidate] = []
     while True:
         rest = tree.subset(free)
-        starts = _starts(rest, sigma, radius_range, config)
-        measured = [_measured(rest, start, _REACH, sigma, config) for start in starts]
+        starts = _starts(rest, criteria.noise, radius_range, seed)
+        measured = [_measured(rest, start, _REACH, criteria) for start in starts]
         good = [each for each in measured if each is not None and (around.outwardness(each) or -1.0) < 0.0]
         if not good:
             return found
-        best = _grown(rest, max(good, key=lambda candidate: candidate.points), sigma, config)
+        best = _grown(rest, max(good, key=lambda candidate: candidate.points), criteria)
         found.append(best)
         cylinder = best.cylinder
         # The pipe goes on as far as the camera sees, too rough there to be measured.
@@ -77,25 +74,11 @@ def find_concave(
         free[tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)] = False
 
 
-def is_concave_pipe(candidate: Candidate, sigma: float, config: DetectConfig) -> bool:
-    """Whether the evidence makes a pipe of a cylinder that is seen from inside."""
-    evidence, cylinder = candidate.evidence, candidate.cylinder
-    return (
-        cylinder.length >= max(0.5 * cylinder.radius, config.length_min)
-        and candidate.radius_sigma < 0.02 * cylinder.radius
-        and evidence.arc >= max(_LEAST_ARC, np.radians(config.arc_min_deg))
-        and evidence.coverage > 0.4
-        and evidence.inside < _STRAY
-        and evidence.noise < min(_ROUGHNESS * (1.6 * sigma + 8e-4), _ROUGHEST * cylinder.radius)
-        and evidence.roundness < _ROUGHNESS * (0.3 * sigma + 0.02 * cylinder.radius + 3e-4)
-    )
-
-
-def _measured(tree: Octree, start: Cylinder, stretch: float, sigma: float, config: DetectConfig) -> Candidate | None:
+def _measured(tree: Octree, start: Cylinder, stretch: float, criteria: AcceptanceCriteria) -> Candidate | None:
     """The pipe that a nearly right cylinder is, as far as `stretch` radii either side; None where it is none."""
     middle = start.middle
     cylinder = start
-    most = wide = _ROUGHNESS * (1.2 * sigma + 5e-4)
+    most = wide = _ROUGHNESS * (1.2 * criteria.noise + 5e-4)
     # The band decides which points are fitted, and the fit what the band holds.
     for _ in range(_MOST_TURNS):
         half = stretch * cylinder.radius * cylinder.axis
@@ -109,15 +92,15 @@ def _measured(tree: Octree, start: Cylinder, stretch: float, sigma: float, confi
         cylinder, wide = candidate.cylinder, min(candidate.band, most)
         if change < 0.5 * candidate.radius_sigma:
             break
-    if not is_concave_pipe(candidate, sigma, config) or _beyond(points, candidate) > _STRAY * candidate.points:
+    if not criteria.accept(candidate) or _beyond(points, candidate) > _INTRUSION_MAX * candidate.points:
         return None
     return candidate
 
 
-def _grown(tree: Octree, pipe: Candidate, sigma: float, config: DetectConfig) -> Candidate:
+def _grown(tree: Octree, pipe: Candidate, criteria: AcceptanceCriteria) -> Candidate:
     """The pipe as far as its surface can be followed: farther on it is rougher, what draws the radius is left out."""
     for stretch in _STRETCHES:
-        more = _measured(tree, pipe.cylinder, stretch, sigma, config)
+        more = _measured(tree, pipe.cylinder, stretch, criteria)
         if more is None or abs(more.cylinder.radius - pipe.cylinder.radius) > 2.0 * pipe.radius_sigma:
             break
         # The far end closes the circle once more, a gap away.
@@ -150,7 +133,7 @@ def _beyond(points: FloatArray, candidate: Candidate) -> int:
     return int(np.minimum(wall, behind).sum())
 
 
-def _starts(tree: Octree, sigma: float, radius_range: tuple[float, float], config: DetectConfig) -> list[Cylinder]:
+def _starts(tree: Octree, sigma: float, radius_range: tuple[float, float], seed: int) -> list[Cylinder]:
     """Cylinders through two sites each that most of their circumference agrees with, sharpened, the best first."""
     if len(tree.points) < 50:
         return []
@@ -165,7 +148,7 @@ def _starts(tree: Octree, sigma: float, radius_range: tuple[float, float], confi
     points, across = shape.feet[good], shape.normals[good]
     # Near the camera the cloud is dense and fine, far from it neither: what is dense tells more.
     weight = shape.count[good].astype(float)
-    rng = np.random.default_rng(config.seed)
+    rng = np.random.default_rng(seed)
     share = np.cumsum(weight) / weight.sum()
     pairs = np.minimum(np.searchsorted(share, rng.random((_PAIRS, 2))), len(good) - 1)
     centres, axes, radii = _through_pairs(points, across, pairs, radius_range)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
@@ -32,13 +34,12 @@ def join(cylinders: Sequence[Cylinder]) -> list[list[int]]:
     Two pieces are one pipe where axis and radius agree and the gap is one that fittings, clamps and occluders make:
     up to ten radii or 30 cm, or up to the shorter piece's length where the axes agree closely.
     """
-    group = list(range(len(cylinders)))
-    for i, one in enumerate(cylinders):
-        for j in range(i + 1, len(cylinders)):
-            if group[i] != group[j] and _one_pipe(one, cylinders[j]):
-                old, new = max(group[i], group[j]), min(group[i], group[j])
-                group = [new if member == old else member for member in group]
-    return [[k for k in range(len(cylinders)) if group[k] == first] for first in sorted(set(group))]
+    count = len(cylinders)
+    one_pipe = np.zeros((count, count), bool)
+    for i, j in combinations(range(count), 2):
+        one_pipe[i, j] = _one_pipe(cylinders[i], cylinders[j])
+    groups, label = connected_components(one_pipe, directed=False)
+    return [np.flatnonzero(label == group).tolist() for group in range(groups)]
 
 
 def spanning(pieces: Sequence[Cylinder], best: int) -> Cylinder:

@@ -24,19 +24,27 @@ _OFFSET, _BITS = 1 << 20, 21
 
 
 class MapChange:
-    """Remembers how many points a survey's last map had where, and the cylinders that were found in it.
-
-    Attributes:
-        known: cylinders of the last map, in its frame; set by who finds them.
-    """
+    """How many points a survey's last map had where, and the cylinders that were found in it."""
 
     def __init__(self) -> None:
-        self.known: Sequence[Cylinder] = ()
+        self._known: Sequence[Cylinder] = ()
         self._keys: NDArray[np.int64] = np.zeros(0, np.int64)
         self._counts: NDArray[np.int64] = np.zeros(0, np.int64)
 
-    def of(self, points: FloatArray) -> NDArray[np.bool_]:
-        """Which points (N, 3) [m] of the next map lie about a place that shows more than it did in the last one."""
+    @property
+    def known(self) -> Sequence[Cylinder]:
+        """The cylinders of the last map, in its frame."""
+        return self._known
+
+    def remember(self, cylinders: Sequence[Cylinder]) -> None:
+        """Takes the cylinders that were found in this map, in its frame, for the next one."""
+        self._known = tuple(cylinders)
+
+    def fresh(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Which points (N, 3) [m] of a map lie about a place that shows more than it did in the last one.
+
+        The map then counts as the last one.
+        """
         grid = np.floor(points / _CELL).astype(np.int64)
         keys, cell_of, counts = np.unique(_key(grid), return_inverse=True, return_counts=True)
         cells = np.empty((len(keys), 3), np.int64)

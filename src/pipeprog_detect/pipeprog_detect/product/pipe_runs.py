@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import combinations, permutations, product
 
 import numpy as np
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeprog_camera.arrays import FloatArray
@@ -53,14 +52,14 @@ def pipe_runs(pipes: Sequence[Pipe]) -> list[PipeRun]:
     """The runs r01, r02, ... that the pipes form, each pipe in one of them, in the order of their first pipes."""
     joints = find_joints(pipes)
     number = {pipe.id: k for k, pipe in enumerate(pipes)}
-    rows = [[number[name] for name in joint.pipes] for joint in joints]
-    one, other = np.array(rows, int).reshape(-1, 2).T
-    connected = coo_array((np.ones(len(joints)), (one, other)), shape=(len(pipes), len(pipes)))
+    connected = np.zeros((len(pipes), len(pipes)), bool)
+    for joint in joints:
+        connected[number[joint.pipes[0]], number[joint.pipes[1]]] = True
     count, label = connected_components(connected, directed=False)
     runs = []
     for run in range(count):
         own = [pipe for pipe, its in zip(pipes, label, strict=True) if its == run]
-        fittings = tuple(joint for joint, row in zip(joints, rows, strict=True) if label[row[0]] == run)
+        fittings = tuple(joint for joint in joints if label[number[joint.pipes[0]]] == run)
         barrel = sum(pipe.cylinder.length for pipe in own)
         centre_line = barrel + sum(joint.length for joint in fittings)
         runs.append(PipeRun(f"r{run + 1:02d}", tuple(pipe.id for pipe in own), fittings, barrel, centre_line))

@@ -42,23 +42,23 @@ def pipe(place: float, radius: float = 0.0365, high: float = 0.9) -> tuple[Cylin
 @given(st.tuples(*[st.floats(-0.02, 0.02)] * 3), st.integers(0, 99))
 def test_a_map_that_an_adjustment_moved_is_no_news(shift: tuple[float, float, float], seed: int) -> None:
     novelty = MapChange()
-    assert novelty.of(wall(0, 1)).all()
-    assert not novelty.of(wall(0, 1, seed) + shift).any()
+    assert novelty.fresh(wall(0, 1)).all()
+    assert not novelty.fresh(wall(0, 1, seed) + shift).any()
 
 
 def test_news_are_what_is_new_and_what_is_near_it() -> None:
     novelty = MapChange()
-    novelty.of(wall(0, 1))
+    novelty.fresh(wall(0, 1))
     points = np.concatenate([wall(0, 1), wall(1, 1.5, 1)])
-    news = novelty.of(points)
+    news = novelty.fresh(points)
     assert news[points[:, 0] > 1.0].all()
     assert not news[points[:, 0] < 0.4].any()
 
 
 def test_a_place_that_is_seen_better_is_news() -> None:
     novelty = MapChange()
-    novelty.of(wall(0, 1)[::2])
-    assert novelty.of(wall(0, 1)).all()
+    novelty.fresh(wall(0, 1)[::2])
+    assert novelty.fresh(wall(0, 1)).all()
 
 
 def found(cloud: np.ndarray, memory: MeasurementCache) -> list[Cylinder]:
