@@ -1,13 +1,20 @@
-"""The process that reconstructs: bundle adjustment holds Python's lock for seconds, which a node cannot afford."""
+"""The loop of the reconstruction's process: commands of the node in, events for the node out.
+
+A process of its own, for two reasons. Its Python code would compete with the node's callbacks for the interpreter lock;
+no single call keeps the lock for long: the compiled adjustment, pycolmap's pose estimation and OpenCV release it, and
+SuperLU's factorisation keeps it for a part of its time only (0.2 of 0.8 s for 400 views, measured). And what crashes
+or exhausts the memory ends this process, not the node, which then starts another one.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Protocol
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
@@ -18,8 +25,8 @@ from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstructio
 from pipeprog_sfm.sparse.overlap import OverlapReport
 from pipeprog_sfm.warm_up import warm_up
 
-IDLE_SECONDS = 1.0  # without a command, after which a map goes out early: nobody knows when the next keyframe comes
-POLL_SECONDS = 0.1  # between looks at the map under way
+IDLE_SECONDS = 1.0  # without a command, after which a map is published early: the next keyframe may never come
+POLL_SECONDS = 0.1  # between checks whether the requested map is finished
 
 
 @dataclass(frozen=True)
@@ -87,44 +94,68 @@ class Finished:
     problem: str
 
 
+Command = AddKeyframe | Retire | Finish
+Event = Ready | KeyframeDone | Retired | MapReady | Finished
+
+
+class Channel(Protocol):
+    """What the loop needs of a multiprocessing connection."""
+
+    def poll(self, timeout: float | None) -> bool:
+        """Waits for a command, for `timeout` seconds or, with None, for ever; whether one has come."""
+
+    def recv(self) -> Command:
+        """Takes the next command; raises EOFError when the other end is closed."""
+
+    def send(self, event: Event) -> None:
+        """Sends an event."""
+
+
 def serve(
-    connection: Connection,
-    config: SfmConfig,
-    board_file: BoardFile,
-    answered: Iterable[AddKeyframe | Retire],
+    connection: Connection, config: SfmConfig, board_file: BoardFile, answered: Iterable[AddKeyframe | Retire]
 ) -> None:
-    """Works off commands from `connection` until it closes; those that a predecessor has answered come before."""
+    """Processes commands from `connection` until it closes; those that a predecessor has answered come first."""
     warm_up(config)
-    reconstruction = Reconstruction(config, board_file)
-    for command in answered:
-        _answer(reconstruction, command)
+    work(connection, Reconstruction(config, board_file), config.map_interval, answered)
+
+
+def work(
+    channel: Channel,
+    reconstruction: Reconstruction,
+    map_interval: int,
+    answered: Iterable[AddKeyframe | Retire],
+    clock: Callable[[], float] = time.monotonic,
+) -> None:
+    """As `serve`; a map is requested after `map_interval` keyframes, or IDLE_SECONDS without a command."""
+    for earlier in answered:
+        _answer(reconstruction, earlier)
         reconstruction.update_dense()
-    connection.send(Ready())
-    since_map, idle_since = 0, time.monotonic()
+    channel.send(Ready())
+    since_map, idle_since = 0, clock()
     while True:
         busy = since_map > 0 or reconstruction.is_mapping
-        if connection.poll(POLL_SECONDS if busy else None):
-            command = connection.recv()
+        if channel.poll(POLL_SECONDS if busy else None):
+            command = channel.recv()
             if isinstance(command, Finish):
                 reconstruction.move(command.motion)
-                connection.send(_finish(connection, reconstruction, command.colmap))
+                channel.send(_finish(channel, reconstruction, command.colmap))
                 since_map = 0  # another map after the last one would have a stamp that no pipes have
                 continue
-            connection.send(_answer(reconstruction, command))
+            channel.send(_answer(reconstruction, command))
             if isinstance(command, AddKeyframe):
                 reconstruction.update_dense()  # once the pose is out
                 since_map += 1
-            idle_since = time.monotonic()
+            idle_since = clock()
         try:
             metric_map = reconstruction.finished_map()
         except NotMetricError:
             metric_map, since_map = None, max(since_map, 1)
         if metric_map is not None:
-            connection.send(MapReady(reconstruction.status(), metric_map))
-        idle = since_map > 0 and time.monotonic() - idle_since > IDLE_SECONDS
-        if not reconstruction.is_mapping and (since_map >= config.map_interval or idle):
+            channel.send(MapReady(reconstruction.status(), metric_map))
+        idle = since_map > 0 and clock() - idle_since > IDLE_SECONDS
+        if not reconstruction.is_mapping and (since_map >= map_interval or idle):
             since_map = 0
-            with contextlib.suppress(NotMetricError):  # the status tells
+            with contextlib.suppress(NotMetricError):  # the status says why
                 reconstruction.request_map()
 
 
@@ -142,17 +173,17 @@ def _add(reconstruction: Reconstruction, keyframe: AddKeyframe) -> KeyframeDone:
     except InputError as error:
         reconstruction.skip(keyframe.stamp, str(error))
     trajectory = None
-    with contextlib.suppress(NotMetricError):  # the status tells
+    with contextlib.suppress(NotMetricError):  # the status says why
         trajectory = reconstruction.trajectory()
     return KeyframeDone(keyframe.stamp, reconstruction.status(), reconstruction.overlap_reports(), trajectory)
 
 
-def _finish(connection: Connection, reconstruction: Reconstruction, colmap: str) -> Finished:
+def _finish(channel: Channel, reconstruction: Reconstruction, colmap: str) -> Finished:
     try:
         metric_map = reconstruction.finish()
     except NotMetricError as error:
         return Finished(reconstruction.status(), str(error))
-    connection.send(MapReady(reconstruction.status(), metric_map))
+    channel.send(MapReady(reconstruction.status(), metric_map))
     if colmap:
         reconstruction.write_colmap(Path(colmap))
     return Finished(reconstruction.status(), "")

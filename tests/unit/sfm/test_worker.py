@@ -1,30 +1,35 @@
-"""The loop of the process that reconstructs, beside a reconstruction that answers at once."""
+"""The loop of the reconstruction's process, with a reconstruction that answers at once and a scripted connection."""
 
-import multiprocessing
-import threading
+from __future__ import annotations
 
-import numpy as np
+from typing import Any, cast
+
 import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm import worker
-from pipeprog_sfm.boards.board_file import BoardFile
-from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.worker import IDLE_SECONDS, POLL_SECONDS
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+KEYFRAME = worker.AddKeyframe(1, b"", CAMERA)
+MAP_INTERVAL = 3
 
 
 class Prompt:
     """Stands for a Reconstruction whose maps are there as soon as they are asked for."""
 
-    def __init__(self, config: SfmConfig, board_file: BoardFile) -> None:
+    def __init__(self) -> None:
         self.is_mapping = False
+        self.keyframes: list[int] = []
 
-    def add(self, *keyframe: object) -> None:
-        pass
+    def add(self, stamp: int, *keyframe: object) -> None:
+        self.keyframes.append(stamp)
 
     def move(self, motion: object) -> None:
         pass
+
+    def retire(self, stamps: tuple[int, ...]) -> None:
+        self.keyframes = [stamp for stamp in self.keyframes if stamp not in stamps]
 
     def update_dense(self) -> None:
         pass
@@ -49,46 +54,68 @@ class Prompt:
         return "last map"
 
 
-@pytest.fixture
-def serving(monkeypatch):
-    monkeypatch.setattr(worker, "Reconstruction", Prompt)
-    monkeypatch.setattr(worker, "warm_up", lambda config: None)
-    monkeypatch.setattr(worker, "IDLE_SECONDS", 0.3)
-    ours, theirs = multiprocessing.Pipe()
+class Script:
+    """A connection that delivers commands; a number in their place is a silence of so many seconds."""
 
-    def run() -> None:
-        with pytest.raises(EOFError):
-            worker.serve(theirs, SfmConfig(), BoardFile(), ())
+    def __init__(self, *steps: worker.Command | float) -> None:
+        self._steps = list(steps)
+        self.now = 0.0
+        self.events: list[Any] = []
 
-    thread = threading.Thread(target=run)
-    thread.start()
-    yield ours
-    ours.close()
-    thread.join(timeout=5.0)
-    assert not thread.is_alive()
+    def poll(self, timeout: float | None) -> bool:
+        left = timeout
+        while self._steps and isinstance(self._steps[0], float):
+            waited = self._steps[0] if left is None else min(self._steps[0], left)
+            self.now += waited
+            self._steps[0] -= waited
+            if self._steps[0] <= 0:
+                self._steps.pop(0)
+            if left is not None:
+                left -= waited
+                if left <= 0:
+                    return False
+        return True
 
+    def recv(self) -> Any:
+        if not self._steps:
+            raise EOFError
+        return self._steps.pop(0)
 
-def received(connection, seconds: float) -> list[object]:
-    events = []
-    while connection.poll(seconds):
-        events.append(connection.recv())
-    return events
-
-
-def keyframe() -> worker.AddKeyframe:
-    return worker.AddKeyframe(1, np.zeros(3, np.uint8).tobytes(), CAMERA)
-
-
-def test_no_map_follows_the_last_one(serving):
-    serving.send(keyframe())
-    serving.send(worker.Finish())
-    events = received(serving, 1.0)
-    assert [type(event) for event in events] == [worker.Ready, worker.KeyframeDone, worker.MapReady, worker.Finished]
-    assert events[2].map == "last map"
+    def send(self, event: object) -> None:
+        self.events.append(event)
 
 
-def test_an_early_map_comes_when_no_keyframe_does(serving):
-    serving.send(keyframe())
-    events = received(serving, 1.0)
-    assert [type(event) for event in events] == [worker.Ready, worker.KeyframeDone, worker.MapReady]
-    assert events[2].map == "early map"
+def events(*steps: worker.Command | float, answered: tuple[worker.AddKeyframe, ...] = ()) -> list[Any]:
+    """What the loop sends until the connection closes."""
+    script = Script(*steps)
+    with pytest.raises(EOFError):
+        worker.work(script, cast(Any, Prompt()), MAP_INTERVAL, answered, lambda: script.now)
+    return script.events
+
+
+def test_no_map_follows_the_last_one() -> None:
+    sent = events(KEYFRAME, worker.Finish(), 10 * IDLE_SECONDS, worker.Retire((1,)))
+    kinds = [worker.Ready, worker.KeyframeDone, worker.MapReady, worker.Finished, worker.Retired]
+    assert [type(event) for event in sent] == kinds
+    assert sent[2].map == "last map"
+
+
+def test_an_early_map_comes_when_no_keyframe_does() -> None:
+    sent = events(KEYFRAME, IDLE_SECONDS + 3 * POLL_SECONDS)
+    assert [type(event) for event in sent] == [worker.Ready, worker.KeyframeDone, worker.MapReady]
+    assert sent[2].map == "early map"
+
+
+def test_no_early_map_comes_while_keyframes_do() -> None:
+    sent = events(KEYFRAME, 0.9 * IDLE_SECONDS, KEYFRAME, 0.9 * IDLE_SECONDS)
+    assert [type(event) for event in sent] == [worker.Ready, worker.KeyframeDone, worker.KeyframeDone]
+
+
+def test_a_map_comes_after_each_interval_of_keyframes() -> None:
+    sent = events(*[KEYFRAME] * (MAP_INTERVAL + 1))
+    done = [worker.KeyframeDone] * MAP_INTERVAL
+    assert [type(event) for event in sent] == [worker.Ready, *done, worker.KeyframeDone, worker.MapReady]
+
+
+def test_what_a_predecessor_answered_is_not_answered_again() -> None:
+    assert [type(event) for event in events(KEYFRAME, answered=(KEYFRAME,))] == [worker.Ready, worker.KeyframeDone]
