@@ -1,4 +1,4 @@
-"""What a process was told to do, on disk, so that another one can take its place."""
+"""The commands that a process was given, on disk, so that another process can take its place."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class Journal:
         return len(self._offsets)
 
     def append(self, command: Any) -> None:
-        """Writes a command down."""
+        """Appends a command."""
         self._offsets.append(self._file.seek(0, os.SEEK_END))
         pickle.dump(command, self._file)
         self._file.flush()
 
     def remove(self, number: int) -> None:
-        """Strikes a command out."""
+        """Removes a command."""
         del self._offsets[number]
 
     def record(self, begin: int, end: int) -> Record:
@@ -51,5 +51,5 @@ class Journal:
         return Record(f"/proc/{os.getpid()}/fd/{self._file.fileno()}", tuple(self._offsets[begin:end]))
 
     def close(self) -> None:
-        """Gives the file up."""
+        """Closes and so deletes the file."""
         self._file.close()

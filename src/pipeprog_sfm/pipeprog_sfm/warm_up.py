@@ -8,7 +8,7 @@ import numpy as np
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.dense.depth_fusion import fuse
+from pipeprog_sfm.dense.depth_fusion import Fusion
 from pipeprog_sfm.dense.stereo import StereoImage, depth_map
 from pipeprog_sfm.reconstruction import Reconstruction
 
@@ -18,7 +18,7 @@ STEP = 24  # px between two views of a wall at 1 m
 
 
 def warm_up(config: SfmConfig) -> None:
-    """Runs each stage on five views of a plane, which takes about a second."""
+    """Runs each stage on five views of a plane; takes about a second once everything is compiled."""
     width, height = SIZE
     camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2)
     wall = np.random.default_rng(0).integers(0, 256, (height // 4, width), np.uint8)
@@ -34,4 +34,7 @@ def warm_up(config: SfmConfig) -> None:
         reconstruction.add(number, cv2.imencode(".png", image)[1].tobytes(), camera)
         reconstruction.overlap_reports()
     maps = [depth_map(view, [other for other in views if other is not view], DEPTHS, config.stereo) for view in views]
-    fuse(maps, {view.stamp: view.camera_from_world for view in views}, 1.0, config.fusion)
+    fusion = Fusion(config.fusion)
+    for view, depth in zip(views, maps, strict=True):
+        fusion.add(depth, view.camera_from_world, 1.0)
+    fusion.cloud()

@@ -31,7 +31,7 @@ POLL_SECONDS = 0.1  # between checks whether the requested map is finished
 
 @dataclass(frozen=True)
 class AddKeyframe:
-    """Command: take this keyframe and the motion before it; `encoded` holds JPEG or PNG bytes."""
+    """Command: add this keyframe; `encoded` holds JPEG or PNG bytes, `motion` what came since the keyframe before."""
 
     stamp: int
     encoded: bytes
@@ -57,12 +57,12 @@ class Finish:
 
 @dataclass(frozen=True)
 class Ready:
-    """Event: keyframes are worked off without delay from now on."""
+    """Event: all code is loaded, keyframes are processed without delay from now on."""
 
 
 @dataclass(frozen=True)
 class KeyframeDone:
-    """Event: a keyframe is worked off; the trajectory is None while there is no scale."""
+    """Event: a keyframe was processed; the trajectory is None while there is no scale."""
 
     stamp: int
     status: Status
@@ -72,7 +72,7 @@ class KeyframeDone:
 
 @dataclass(frozen=True)
 class Retired:
-    """Event: a Retire is worked off."""
+    """Event: a Retire was processed."""
 
     status: Status
     overlaps: list[OverlapReport]

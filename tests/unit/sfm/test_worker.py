@@ -55,7 +55,7 @@ class Prompt:
 
 
 class Script:
-    """A connection that delivers commands; a number in their place is a silence of so many seconds."""
+    """A connection that delivers commands; a float in their place is a silence of that length in seconds."""
 
     def __init__(self, *steps: worker.Command | float) -> None:
         self._steps = list(steps)

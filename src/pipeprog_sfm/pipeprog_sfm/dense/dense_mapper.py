@@ -1,4 +1,4 @@
-"""The dense cloud of a stream of keyframes: which of them get a depth map, made and merged beside the mapper."""
+"""The dense cloud of a stream of keyframes: which of them get a depth map; made and fused in a thread of its own."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from pipeprog_sfm.dense.stereo import DepthMap, StereoImage, choose_pairs, depth
 from pipeprog_sfm.types import EncodedImage
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
-SUBMITTED = 2  # depth maps that stand before a fusion in the queue: more would only make the map wait
+SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits for no more than these
 IMAGE_CACHE = 12  # decoded keyframes at working resolution: a depth map's neighbours are mostly the last few
-NICENESS = 5  # a third of the mapper's share where they compete: its poses are waited for, the cloud is not
-MIN_POINTS = 10  # of a keyframe, to know the range of its depths
-SAMPLE = 200  # of them, to know what other keyframes see of the same
-SAME_SIDE = np.radians(8.0)  # of a surface: farther round (0.14 of the depth), a view is a witness of its own
-SAME_SCALE = 1.5  # of an image: from nearer, more is to be seen
+NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
+MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
+SAMPLE = 200  # points of a keyframe from which its overlap with others is estimated, to 0.04
+SAME_SIDE = np.radians(8.0)  # between rays to a point; beyond (baseline 0.14 of the depth) a view adds information
+SAME_SCALE = 1.5  # ratio of depths; a view that is nearer by more shows more detail
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class _Depth:
 
 
 class DenseMapper:
-    """Depth maps and their fusion, in one thread of low priority beside the mapper's.
+    """Depth maps and their fusion, in one thread of low priority beside the mapper.
 
     A keyframe gets a depth map unless another one shows nearly the same: what is held grows with the map, not with the
     time spent in it. Depth maps are made in the order of the calls with the poses of the call, so that the result does
@@ -47,8 +47,8 @@ class DenseMapper:
 
     def __init__(self, stereo: StereoConfig, fusion: FusionConfig) -> None:
         self._stereo_config, self._fusion_config = stereo, fusion
-        # On a straight walk a point is in sight of 1 / (1 - overlap) depth maps, four times as many as must agree on
-        # it: to the others it may be hidden, slanting, blurred, or too thin to be matched.
+        # On a straight walk a point is visible in 1 / (1 - overlap) depth maps. That is four times the number that
+        # must agree on it: in the others it may be occluded, oblique, blurred, or too thin to be matched.
         self._overlap = 1.0 - 1.0 / (4 * fusion.min_views)
         self._image = lru_cache(maxsize=IMAGE_CACHE)(_decode)
         self._depths: dict[int, Future[_Depth]] = {}

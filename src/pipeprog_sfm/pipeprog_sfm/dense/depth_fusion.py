@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +12,9 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import FusionConfig
 from pipeprog_sfm.dense.stereo import DepthMap
 
-AGREEMENT = 0.01  # of the depth: views that agree this well have seen the same surface
-OVERLAP_MIN = 0.15  # share of a view that another one must see to be asked
-VIEW_ANGLE_MAX = np.radians(60.0)  # beyond, surfaces seen by both are seen aslant by one of them
+AGREEMENT = 0.01  # relative difference of depth up to which two views have seen the same surface
+OVERLAP_MIN = 0.15  # share of a view that another one must see to be compared with it
+VIEW_ANGLE_MAX = np.radians(60.0)  # between optical axes; beyond, one of the two sees a common surface obliquely
 GRAZING_COS = 0.17  # surfaces seen at less than 10 degrees carry no usable depth
 
 
@@ -38,7 +37,7 @@ class _View:
 
 
 class Fusion:
-    """Merges depth maps as they come; what a map adds is what earlier maps confirm."""
+    """Merges depth maps as they are made; a map adds the points that earlier maps confirm."""
 
     def __init__(self, config: FusionConfig) -> None:
         self._config = config
@@ -100,17 +99,6 @@ class Fusion:
                 shares.append((-inside.mean(), index))
         best = sorted(index for _, index in sorted(shares)[: self._config.max_neighbours])
         return [self._views[index] for index in best]
-
-
-def fuse(
-    depth_maps: Sequence[DepthMap], cameras_from_map: Mapping[int, FloatArray], scale: float, config: FusionConfig
-) -> FusedCloud:
-    """All depth maps with their final poses, by stamp; maps without a pose are left out."""
-    fusion = Fusion(config)
-    for depth_map in sorted(depth_maps, key=lambda m: m.stamp):
-        if depth_map.stamp in cameras_from_map:
-            fusion.add(depth_map, cameras_from_map[depth_map.stamp], scale)
-    return fusion.cloud()
 
 
 class _VoxelHash:

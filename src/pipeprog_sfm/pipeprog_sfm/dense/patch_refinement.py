@@ -1,4 +1,4 @@
-"""Sub-pixel depth: small slanted patches, compared in all neighbours at once and moved until they match.
+"""Sub-pixel depth: small slanted patches, compared with all neighbours at once and moved until they match.
 
 Propagation of planes between pixels follows Bleyer, Rhemann and Rother, "PatchMatch stereo", 2011; the step to the
 best match is Gauss-Newton on the zero-mean differences, as in Furukawa and Ponce's patches, 2010.

@@ -78,7 +78,7 @@ def _census(image, stride):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=True, error_model="numpy")
 def _cost_volume(census, others, homographies, epipoles, least, step, count):  # type: ignore[no-untyped-def]
-    """(h, w, count) uint8: sum of the two best views' Hamming distances, so that one occluded side does no harm."""
+    """(h, w, count) uint8: Hamming distances of the two best views, summed: occlusion on one side does not matter."""
     height, width = census.shape
     number, other_height, other_width = others.shape
     costs = np.empty((height, width, count), np.uint8)

@@ -1,7 +1,8 @@
 """Bundle adjustment of calibrated views: Levenberg-Marquardt on the Schur complement of the points.
 
-Own code rather than the solver that pycolmap wraps: that one wants the map as one Python object per observation, holds
-Python's lock while it works, and is several times slower on problems of this size.
+Own code rather than the solver that pycolmap wraps: that one needs one Python object per observation, and its adjuster
+of a part of a map (BundleAdjuster.solve, which can keep views fixed) holds the interpreter lock for the whole call
+(pycolmap 4.2.1: 16 s for 480 000 observations without another thread running). Here the compiled functions release it.
 Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000.
 """
 
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 
-DIFFERENCE = 1e-3  # px that residuals are moved by for their derivatives: far above rounding, far below their curvature
-HOLD = 1e6  # what holds a coordinate, in units of its pose's largest entry
+DIFFERENCE = 1e-3  # px, step of numerical derivatives of residuals: far above rounding (1e-12), below curvature (px)
+INITIAL_DAMPING = 1e-4  # of Levenberg-Marquardt, relative to the diagonal: nearly Gauss-Newton, as poses are near
+MAX_DAMPINGS = 6  # tenfold increases after which an iteration is given up: a damping of 100 hardly moves anything
+HOLD = 1e6  # weight that fixes a coordinate, relative to the largest entry of its pose: 1e-6 of its freedom is left
 
 
 @dataclass(frozen=True)
@@ -65,36 +68,24 @@ class Bundle:
         return replace(self, rotation=rotation, translation=translation, points=self.points + moves)
 
 
-@dataclass(frozen=True)
-class Adjusted:
-    """The bundle after an adjustment, and the cost before and after."""
-
-    bundle: Bundle
-    initial_cost: float
-    cost: float
-    iterations: int
-
-
 def adjust(
     bundle: Bundle, free: NDArray[np.bool_], *, loss_scale: float, max_iterations: int, tolerance: float
-) -> Adjusted:
-    """Minimises Cauchy-robust reprojection errors over points and free views.
+) -> Bundle:
+    """Minimises Cauchy-robust reprojection errors over points and free views; returns the adjusted bundle.
 
-    free (C,): views that may move; loss_scale px, of the Cauchy loss. Ends when an iteration gains less than
-    `tolerance` of the cost.
+    free (C,): views that may move; loss_scale px, of the Cauchy loss. Ends when an iteration reduces the cost by less
+    than `tolerance` of it.
     """
     start, view = bundle.start, bundle.view
     index = np.where(free, np.cumsum(free) - 1, -1)
     count = int(free.sum())
     pairs, row, column = _pairs(start, view, index, count)
-    cost = initial = _cost(*bundle.arrays(), loss_scale)
-    damping = 1e-4
-    iteration = 0
-    while iteration < max_iterations:
-        iteration += 1
+    cost = _cost(*bundle.arrays(), loss_scale)
+    damping = INITIAL_DAMPING
+    for _ in range(max_iterations):
         u, gc, v, gp, w = _linearise(*bundle.arrays(), index, count, loss_scale)
         gained = 0.0
-        for _ in range(6):
+        for _ in range(MAX_DAMPINGS):
             blocks, gradient, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(row), damping)
             step = _solve(blocks, row, column, gradient).reshape(-1, 6)
             moves = _back_substitute(step, gp, w, v_inverse, start, view, index)
@@ -108,24 +99,24 @@ def adjust(
             damping *= 10
         if gained <= tolerance * cost:
             break
-    return Adjusted(bundle, initial, cost, iteration)
+    return bundle
 
 
 def function_covariance(gradients: FloatArray, bundle: Bundle, *, loss_scale: float) -> FloatArray:
     """(S, S) covariance of S functions of all adjusted poses which no similarity of the whole model changes.
 
     gradients (S, C, 6): derivatives by each pose, turned from the left by a vector and shifted; bundle: at the minimum
-    that `adjust` finds. This is the covariance of an M-estimator that trusts nothing but the independence of the
-    points (Huber 1967; White 1982; Liang and Zeger 1986, with points as clusters): whatever the localisation of a
-    feature has in common over the views of its point, and whatever the residuals show beyond noise, is counted.
+    that `adjust` finds. This is the sandwich covariance of an M-estimator with the points as clusters (Huber 1967;
+    White 1982; Liang and Zeger 1986): it assumes that points are independent, and nothing else. Errors that the
+    features of one point have in common, and residuals larger than the noise, are included.
     """
     start, view, count = bundle.start, bundle.view, len(bundle.rotation)
     centres = -np.einsum("cji,cj->ci", bundle.rotation, bundle.translation)
-    index = np.append(np.arange(count - 1), -1)  # the last pose holds the model's place
+    index = np.append(np.arange(count - 1), -1)  # the last pose fixes the model's position and orientation
     pairs, row, column = _pairs(start, view, index, count - 1)
     u, gc, v, gp, w = _linearise(*bundle.arrays(), index, count - 1, loss_scale)
     blocks, _, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(row), 0.0)
-    # One coordinate of the pose farthest from it holds the size.
+    # One coordinate of the pose farthest from it fixes the scale.
     far = int(np.linalg.norm(centres - centres[-1], axis=1).argmax())
     axis = 3 + int(np.abs(bundle.rotation[far] @ (centres[far] - centres[-1])).argmax())
     blocks[pairs[far, far], axis, axis] += HOLD * np.abs(blocks[pairs[far, far]]).max()
@@ -144,9 +135,9 @@ def function_covariance(gradients: FloatArray, bundle: Bundle, *, loss_scale: fl
         derivative = (ends[0] - ends[1]) / (2 * size)
         score = np.add.reduceat(weight * (error * derivative).sum(axis=1), start[:-1])
         share = np.add.reduceat(weight * (derivative**2).sum(axis=1), start[:-1])
-        # A point that much depends on pulls the function along and hides its error (the jackknife's correction).
+        # A point of high leverage fits itself and hides its error: the jackknife's correction.
         scores[number] = score / (1.0 - share / share.sum())
-    # A robust loss curves less than its weights say, and the poses absorb some of the residuals.
+    # The robust loss has less curvature than its weights imply, and the poses absorb part of the residuals.
     curvature = float((weight - square * weight**2 / loss_scale**2).mean() / weight.mean())
     freedom = 2 * len(view) - 3 * len(bundle.points)
     return scores @ scores.T / curvature**2 * freedom / max(freedom - 6 * count + 7, 1)
@@ -165,8 +156,8 @@ def rotation_from_vector(vectors: FloatArray) -> FloatArray:
 def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatArray) -> FloatArray:
     """Solves the symmetric system given by its upper (6, 6) blocks.
 
-    Sparse even where it is small and full: a dense solver's threads cost more than they gain, and their number would
-    show in the last bits.
+    A sparse solver also for small, full systems: a dense solver's threads cost more than they gain, and the result's
+    last bits would depend on their number. SuperLU holds the interpreter lock for a quarter of its factorisation.
     """
     count = len(gradient)
     if not count:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 
-PIXELS = 600_000  # of the image that is searched: finer detail is mostly noise, and SIFT looks at twice this resolution
-CONTRAST = 0.004  # a third of it per scale layer is a third of a grey level: bare painted walls show no more
-TILES = (16, 9)  # the strongest of each tile come first, so that a thinly textured part of the image is heard
+PIXELS = 600_000  # above, the image is halved: finer detail is mostly noise, and SIFT doubles the resolution itself
+CONTRAST = 0.004  # of the grey range; divided by 3 layers it is a third of a grey level, as bare painted walls have
+TILES = (16, 9)  # features are ranked within tiles, so that weakly textured regions of the image are represented
 
 
 @dataclass(frozen=True)

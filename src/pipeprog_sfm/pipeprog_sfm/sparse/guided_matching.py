@@ -1,4 +1,4 @@
-"""A registered view tied to the others: matched along epipolar segments with those that look at the same place."""
+"""Guided matching: a registered view is matched along epipolar segments with the views that see the same place."""
 
 from __future__ import annotations
 
@@ -11,10 +11,17 @@ from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.matching import MatchArray, match_guided
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
-GUIDED_RADIUS = 4.0  # px around the epipolar segment
-TEMPORAL = 3  # neighbours in time that every keyframe is matched with
-COVISIBLE = 5  # further views by predicted overlap
-SAMPLE = 50  # points that tell the overlap with every other view, to a fifteenth
+GUIDED_RADIUS = 4.0  # px around the epipolar segment, as POSE_ERROR: poses are known to a pixel or two
+TEMPORAL = 3  # neighbours in time that every keyframe is matched with: at 80 % overlap they see nearly the same
+COVISIBLE = 5  # further views, those of the largest predicted overlap: a constant cost per keyframe
+MIN_OVERLAP = 0.3  # share of the sampled points that such a view must see: fewer give few new matches for the cost
+MAX_ANGLE = np.radians(40)  # between optical axes: SIFT matches a patch seen from up to some 40 degrees aside
+MAX_SCALE = 2.0  # ratio of depths: SIFT matches a patch at up to twice the scale
+# The depth range of a view, for features without a point: half the 2nd and twice the 98th percentile of the depths of
+# its points, as surfaces without features lie outside of the range of the points.
+DEPTH_PERCENTILES, DEPTH_MARGIN = (2, 98), 2.0
+DEPTH_TOLERANCE = 0.05  # of the depth of a point around which its match is sought: its noise at the smallest angle
+SAMPLE = 50  # points from which overlap with every other view is predicted: its error is sqrt(0.25 / 50) = 0.07
 
 
 def link(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> None:
@@ -27,7 +34,8 @@ def link(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> No
     depth = depth[depth > 0]
     if not len(depth):
         return
-    depth_range = float(0.5 * np.percentile(depth, 2)), float(2.0 * np.percentile(depth, 98))
+    near, far = np.percentile(depth, DEPTH_PERCENTILES)
+    depth_range = float(near / DEPTH_MARGIN), float(DEPTH_MARGIN * far)
     features, others = [], []
     for other in partners(model, view, keyframes[model.stamps[view]].camera):
         found = _match_guided(model, view, other, keyframes, depth_range)
@@ -41,30 +49,29 @@ def link(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> No
 
 
 def partners(model: SparseModel, view: int, camera: Camera) -> list[int]:
-    """Neighbours in time, then the views into which most of the view's points project from a like direction.
+    """Neighbours in time, then the views that see most of the view's points from a similar direction and distance.
 
-    camera: of the view, and taken for that of the others.
+    camera: of the view; the others are assumed to have the same.
     """
     gap = np.abs(np.array(model.stamps) - model.stamps[view])
     gap[view] = np.iinfo(np.int64).max
     temporal = [int(other) for other in np.argsort(gap, kind="stable")[:TEMPORAL] if other != view]
     seen = model.seen(view)
     sample = model.points[seen[:: max(len(seen) // SAMPLE, 1)]]
-    # One product of matrices, coordinate by coordinate: this is all that looks at every view of the map.
+    # One matrix product, coordinate by coordinate: the only step whose cost grows with the number of views.
     inside = (model.rotation.reshape(-1, 3) @ sample.T).reshape(len(model), 3, -1) + model.translation[..., None]
     depth = inside[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = inside[:, 0] / depth, inside[:, 1] / depth
     visible = (depth > 0) & (np.abs(u) < 0.5 * camera.width / camera.fx)
     visible &= np.abs(v) < 0.5 * camera.height / camera.fy
-    # SIFT finds a patch again when it is seen from within some 40 degrees and at up to twice the scale.
     own = depth[view]
-    visible &= (depth < 2 * own) & (2 * depth > own)
-    alike = model.rotation[:, 2] @ model.rotation[view, 2] > np.cos(np.radians(40))
-    score = np.where(alike, visible.mean(axis=1), 0.0)
+    visible &= (depth < MAX_SCALE * own) & (MAX_SCALE * depth > own)
+    similar = model.rotation[:, 2] @ model.rotation[view, 2] > np.cos(MAX_ANGLE)
+    score = np.where(similar, visible.mean(axis=1), 0.0)
     score[[view, *temporal]] = 0.0
     best = np.argsort(-score, kind="stable")[:COVISIBLE]
-    return temporal + [int(other) for other in best if score[other] > 0.3]
+    return temporal + [int(other) for other in best if score[other] > MIN_OVERLAP]
 
 
 def _match_guided(
@@ -79,7 +86,7 @@ def _match_guided(
     own = model.point_of[model.features(view)]
     has = own >= 0
     depth = model.points[own[has]] @ model.rotation[view, 2] + model.translation[view, 2]
-    low[has], high[has] = 0.95 * depth, 1.05 * depth
+    low[has], high[has] = (1 - DEPTH_TOLERANCE) * depth, (1 + DEPTH_TOLERANCE) * depth
     direction = np.c_[mine.rays, np.ones(len(mine.rays))] @ rotation.T
     focal, centre = theirs.focal, np.array([theirs.camera.cx, theirs.camera.cy])
     ends = []

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 MatchArray = NDArray[np.int32]
 
 RATIO = 0.8  # Lowe, IJCV 2004: nearest over second nearest descriptor distance
-GUIDED_RATIO = 0.9  # the geometry has ruled out most wrong candidates already
-MAX_DISTANCE = 0.7  # of unit descriptors (45 degrees are 0.77): worse pairs are of different places
+GUIDED_RATIO = 0.9  # higher than RATIO: the epipolar segment excludes most wrong candidates already
+MAX_DISTANCE = 0.7  # between unit descriptors (45 degrees are 0.77): of different places beyond
 SAME_PLACE = 4.0  # px: a second candidate this near is the same corner at another orientation or scale
-CELL = 24.0  # px, of the grid that guided matching searches
+CELL = 24.0  # px, of the grid that guided matching searches: a few features each
 
 
 def match(descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], ratio: float = RATIO) -> MatchArray:

@@ -65,6 +65,6 @@ def _adjust(
     )  # fmt: skip
     loss_scale = CAUCHY * model.noise
     adjusted = adjust(bundle, free[used], loss_scale=loss_scale, max_iterations=max_iterations, tolerance=tolerance)
-    model.rotation[used], model.translation[used] = adjusted.bundle.rotation, adjusted.bundle.translation
-    model.points[ids] = adjusted.bundle.points
+    model.rotation[used], model.translation[used] = adjusted.rotation, adjusted.translation
+    model.points[ids] = adjusted.points
     return ids, start, features

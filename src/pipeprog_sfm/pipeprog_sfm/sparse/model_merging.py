@@ -11,7 +11,7 @@ from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS, Location
 from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
-DEPTH_TOLERANCE = 0.05  # of a point's depth in two models: its noise at the smallest angle
+DEPTH_TOLERANCE = 0.05  # relative difference of a point's depth in two models: its noise at the smallest ray angle
 
 
 def merge_models(sparse_map: SparseMap, localizer: Localizer, stamp: int) -> None:

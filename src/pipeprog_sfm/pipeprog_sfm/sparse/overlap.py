@@ -1,4 +1,4 @@
-"""How well each keyframe is tied to the map: Eq. 1 of the paper, told when it changes."""
+"""Overlap of each keyframe with the map, Eq. 1 of the paper, reported when it changes."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class OverlapReport:
 
 
 class OverlapTracker:
-    """Remembers of which points of the map each keyframe's overlap was told."""
+    """Remembers for which points of the map the overlap of each keyframe was last reported."""
 
     def __init__(self) -> None:
-        self._told: dict[int, tuple[int | None, int, int | None]] = {}
+        self._reported: dict[int, tuple[int | None, int, int | None]] = {}
 
     def forget(self, stamp: int) -> None:
-        """A keyframe that comes again is told anew."""
-        self._told.pop(stamp, None)
+        """Forgets a keyframe: if it is added again, its overlap is reported again."""
+        self._reported.pop(stamp, None)
 
     def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel) -> list[OverlapReport]:
         """Overlap of the keyframes, by stamp, for which it changed since the last call."""
@@ -48,8 +48,8 @@ class OverlapTracker:
         changed = []
         for before, stamp, after in zip([NO_STAMP, *stamps[:-1]], stamps, [*stamps[1:], NO_STAMP], strict=True):
             mark = (marks.get(before), marks[stamp], marks.get(after))
-            if self._told.get(stamp) != mark:
-                self._told[stamp] = mark
+            if self._reported.get(stamp) != mark:
+                self._reported[stamp] = mark
                 near = (model.point_of[tied[one]] if one in tied else None for one in (before, stamp, after))
                 changed.append(_report(keyframes[stamp], *near))
         return changed

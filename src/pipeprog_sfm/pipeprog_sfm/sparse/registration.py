@@ -1,4 +1,4 @@
-"""An image registered in a model: its pose by the map's points, its tracks, and whether the pose can be believed."""
+"""Registration of a keyframe in a model: its pose from the map's points, its tracks, and the check of the pose."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pipeprog_sfm.sparse.matching import MatchArray
 from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_views
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
-POSE_ERROR = 4.0  # px, for RANSAC: the map's points move by a pixel or two before they are adjusted
-MIN_INLIERS = 20  # of a pose: far above what chance gives at this error
-RIVAL = 0.5  # of a pose's inliers: as many that agree on another pose make it ambiguous, as repeated texture does
-MIN_SHARE = 0.25  # of the matches with the neighbours that a pose must agree with
-LOCAL_WINDOW = 8  # views that local bundle adjustment moves
+POSE_ERROR = 4.0  # px, inlier threshold of RANSAC: points are off by a pixel or two before they are adjusted
+MIN_INLIERS = 20  # of a pose: by chance one match in 18 000 lies within 4 px (of 1280 x 720)
+RIVAL = 0.5  # of a pose's inliers: if this share agrees on another pose, repeated texture makes the pose ambiguous
+MIN_SHARE = 0.25  # of the matches with the neighbours that must agree with a pose: a wrong pose has few per cent
+LOCAL_WINDOW = 8  # views that local bundle adjustment moves: those that see a point at 80 % overlap, and some more
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ def add_view(model: SparseModel, keyframe: Keyframe, location: Location, keyfram
 
 
 def rejection_reason(model: SparseModel, view: int, matches: Mapping[int, MatchArray]) -> str:
-    """Why a pose cannot be believed: too few points, or matches with its neighbours, by stamp, that contradict it."""
-    tied = len(model.seen(view))
-    if tied < MIN_INLIERS:
-        return f"only {tied} points hold its pose"
+    """Why a pose is rejected: too few points, or matches (by stamp) that contradict it; empty if it is accepted."""
+    points = len(model.seen(view))
+    if points < MIN_INLIERS:
+        return f"only {points} points hold its pose"
     errors = [
         epipolar_errors(model, view, model.stamps.index(other), found)
         for other, found in matches.items()
@@ -102,7 +102,7 @@ def _absolute_pose(model: SparseModel, keyframe: Keyframe, pairs: IntArray, seed
 
 
 def _adjust_around(model: SparseModel, view: int) -> None:
-    """Adjusts a view with those that share most points with it."""
+    """Adjusts a view together with the views that share most points with it."""
     shared = model.covisible(view)
     window = np.argsort(-shared, kind="stable")[: LOCAL_WINDOW - 1]
     window = np.append(window[shared[window] > 0], view)

@@ -1,7 +1,7 @@
 """A sparse model: views, points, and which feature sees which point, in flat arrays.
 
 Flat arrays instead of pycolmap's graph, observation manager and triangulator: these accept no match between images that
-they already know (a loop found late, a frame tried again), and every look at them costs one Python object per feature.
+they already know (a loop found late, a frame tried again), and reading them costs one Python object per feature.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MIN_ANGLE = np.radians(1.5)  # between the rays of a point: depth is known to a 
 
 
 class SparseModel:
-    """Views (index, in order of registration) and points of one connected piece of map.
+    """Views (index, in order of registration) and points of one connected part of the map.
 
     `point_of` holds the point of each feature of all views in a row (NONE: no point); the features of view v are
     offsets[v]:offsets[v + 1].

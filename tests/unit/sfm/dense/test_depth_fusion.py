@@ -5,7 +5,7 @@ import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig
-from pipeprog_sfm.dense.depth_fusion import Fusion, fuse
+from pipeprog_sfm.dense.depth_fusion import Fusion
 from pipeprog_sfm.dense.stereo import DepthMap
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -37,6 +37,15 @@ def exact(stamp, camera_from_map, unit=1.0):
 
 POSES = {stamp: pose(0.1 * stamp - 0.25, 0.02 * stamp) for stamp in range(6)}
 MAPS = [exact(stamp, matrix) for stamp, matrix in POSES.items()]
+
+
+def fuse(depth_maps, cameras_from_map, scale, config):
+    """Cloud of all depth maps with poses, in order of time."""
+    fusion = Fusion(config)
+    for depth_map in sorted(depth_maps, key=lambda depth_map: depth_map.stamp):
+        if depth_map.stamp in cameras_from_map:
+            fusion.add(depth_map, cameras_from_map[depth_map.stamp], scale)
+    return fusion.cloud()
 
 
 @pytest.fixture(scope="module")
