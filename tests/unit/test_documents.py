@@ -17,7 +17,7 @@ import typer
 from pipeprog_bringup.cli import app
 from pipeprog_bringup.results.overrides import effective
 from pipeprog_bringup.results.result_files import FRAME_COLUMNS
-from pipeprog_bringup.results.scoring import Result, Segment, Truth, score
+from pipeprog_bringup.results.scoring import Result, Segment, Truth, align, score
 from pipeprog_camera.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -179,7 +179,9 @@ def keys(content: object) -> set[str]:
 
 def test_every_field_of_the_results_is_described() -> None:
     pipe = Segment(np.zeros(3), np.ones(3), 0.05, 1.7, "p01", "DN100")
-    figures = score(Result((pipe,), {"DN100": 0.05}), Truth((pipe,), (), np.zeros((0, 4, 4))))
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[1:, :3, 3] = np.eye(3)
+    figures = score(Result((pipe,), {"DN100": 0.05}), Truth((pipe,), (), poses), align(poses, poses))
     fields = properties(json.loads((ROOT / "docs" / "pipes.schema.json").read_text())) | keys(figures)
     told = set(re.findall(r"\w+", " ".join(in_code((ROOT / "docs" / "files.md").read_text()))))
     assert {*fields, *FRAME_COLUMNS} - told == set()
