@@ -1,4 +1,4 @@
-"""Target boards, what an image shows of one, and which of them look the same."""
+"""Boards, what an image shows of one, and which boards look the same."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 
-MIN_CIRCLES = 3  # circles that identify a board: fewer agree by chance
-LAYOUT_TOLERANCE = 0.1  # of a circle's radius: circles of two layouts closer than that are the same circle
+MIN_CIRCLES = 3  # circles that identify a board and fix its pose; two agree with a wrong pose by chance
+LAYOUT_TOLERANCE = (
+    0.1  # of a circle's radius, up to which circles of two layouts coincide; ellipses are matched to half a radius
+)
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,18 @@ class Board:
 
     @property
     def spread(self) -> float:
-        """Root of the summed squared distances of the circles from their mean, m: the lever that a scale rests on."""
+        """Root of the summed squared distances of the circles from their mean, m.
+
+        An error of the circles' places of standard deviation s makes a relative error s / spread of the scale.
+        """
         return float(np.linalg.norm(self.centres - self.centres.mean(0)))
+
+    @property
+    def half_turn(self) -> FloatArray:
+        """(4, 4) turn by 180 degrees in the board's plane about the mean of its circles, m."""
+        turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+        turn[:3, 3] = 2 * self.centres.mean(0)
+        return turn
 
 
 @dataclass(frozen=True)
@@ -39,9 +51,9 @@ class BoardObservation:
     """Circles of one board in one image; pixels of the ideal pinhole camera.
 
     Attributes:
-        board: name of the board (of the first one where several in the file have the same layout).
+        board: name of the board (of the first one where several in the file share a layout).
         indices: (K,) int, rows of Board.centres.
-        centres: (K, 2) images of the circles' centres, px: the ellipses' centres freed from eccentricity.
+        centres: (K, 2) images of the circles' centres, px: the ellipses' centres corrected for eccentricity.
         ellipse_centres: (K, 2) centres of the ellipses, px.
         conics: (K, 3, 3) the ellipses as conics.
         sigma: standard deviation of one coordinate of a centre, px, from the scatter of the edge points.
@@ -58,15 +70,15 @@ class BoardObservation:
 
 
 def symmetries(board: Board) -> NDArray[np.intp]:
-    """(S, N) orders of the circles that a turn of the board in its plane cannot tell from the given one (row 0).
+    """(S, N) orders of the circles in which the board, turned in its plane, looks the same; row 0 is 0..N-1.
 
-    Mirrored orders are no symmetry: a board is seen from its front.
+    Mirrored orders do not count, since a board is seen from its front.
     """
     return _orders_onto(board, board)
 
 
 def layouts(boards: Sequence[Board]) -> list[list[Board]]:
-    """Boards grouped by layout: images alone cannot tell the members of one group apart."""
+    """Boards grouped by layout: boards of one group cannot be distinguished in an image."""
     groups: list[list[Board]] = []
     for board in boards:
         for group in groups:
@@ -79,7 +91,7 @@ def layouts(boards: Sequence[Board]) -> list[list[Board]]:
 
 
 def _orders_onto(board: Board, other: Board) -> NDArray[np.intp]:
-    """(S, N) orders `o` so that other.centres[o] is board.centres turned in the plane and shifted."""
+    """(S, N) orders `o` for which other.centres[o] is board.centres turned in the plane and shifted."""
     orders: list[NDArray[np.intp]] = []
     if (
         len(board.centres) == len(other.centres)

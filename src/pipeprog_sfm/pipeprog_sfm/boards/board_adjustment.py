@@ -1,4 +1,4 @@
-"""A board's place adjusted on all of its images, and what it inherits from their errors and from the poses."""
+"""A board's place in the model, adjusted on all of its images, and its errors with those of images and poses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_covariance import (
     PRIOR_CENTRE,
@@ -18,18 +17,24 @@ from pipeprog_sfm.boards.board_covariance import (
     image_noise,
     variance_components,
 )
-from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, circle_pixels, image_rows, project_rows
+from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, PosedCamera
 from pipeprog_sfm.boards.triangulation import cross_matrices
-from pipeprog_sfm.config import BoardConfig
+
+VARIANCE_ROUNDS = 4  # each halves the distance of the variance components from their limit, or better
+MAX_STEPS = 6  # Gauss-Newton steps of a round, from a start that triangulation gives to 1 % of the size
+CONVERGED = 1e-10  # largest change of a parameter (rad, model units, log of size) at which the steps end
 
 
 @dataclass(frozen=True)
 class PlacementSensitivity:
-    """What a placement inherits.
+    """How errors of images and poses propagate to a placed board.
+
+    The seven parameters are the turn, the shift and the logarithm of the size about the mean of the board's circles,
+    in radians and model units.
 
     Attributes:
-        covariance: (7, 7) of turn, shift and logarithm of size about the board's middle, model units, from the images.
-        derivatives: (7, 6) of these by each pose, turned and shifted from the left, by stamp.
+        covariance: (7, 7) of the parameters, from the images.
+        derivatives: (7, 6) of the parameters by each pose, turned and shifted from the left, by stamp.
     """
 
     covariance: FloatArray
@@ -37,48 +42,47 @@ class PlacementSensitivity:
 
 
 def adjust_board(
-    board: Board,
-    views: Sequence[BoardView],
-    start: FloatArray,
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    config: BoardConfig,
+    board: Board, views: Sequence[BoardView], model_from_board: FloatArray, posed: PosedCamera
 ) -> PlacedBoard:
-    """The placement adjusted on all views: seven parameters, robust weights, two variance components.
+    """The board placed by a least-squares fit to all views: seven parameters, robust weights, two variance components.
 
-    The residuals of one image share what an error of its pose does to them, so that five circles in one image are
-    not five independent witnesses: the covariance of an image is centre^2 I + pose^2 B B^T, where B holds the
-    derivatives by the camera's place, in px per px at the board.
+    The circles of one image share the error of its pose, so five circles in one image are not five independent
+    measurements: the covariance of an image is centre^2 I + pose^2 B B^T, where B holds the derivatives by the
+    camera's position, scaled to px at the board.
+
+    Args:
+        board: the board.
+        views: images of it, two or more.
+        model_from_board: (4, 4) similarity to start from.
+        posed: camera and poses.
     """
-    placement, centre, pose = start, PRIOR_CENTRE, PRIOR_POSE
-    for _ in range(4):
-        rows = image_rows(views, poses, circle_pixels(views, placement, poses, camera, config))
-        for _ in range(6):
-            residuals, jacobian = _similarity_rows(rows, placement, board, camera)
+    placement, centre, pose = model_from_board, PRIOR_CENTRE, PRIOR_POSE
+    for _ in range(VARIANCE_ROUNDS):
+        rows = posed.rows(views, placement)
+        for _ in range(MAX_STEPS):
+            residuals, jacobian = _similarity_rows(rows, placement, board, posed)
             noise = image_noise(jacobian[:, :, 3:6], rows.groups, centre, pose)
             white, white_jacobian = noise.whitened(residuals[..., None])[..., 0], noise.whitened(jacobian)
             root = np.sqrt(cauchy_weights(white))[:, None]
-            flat, target = (white_jacobian * root[..., None]).reshape(-1, 7), (white * root).ravel()
-            change = np.linalg.lstsq(flat, -target, rcond=None)[0]
+            flat, weighted = (white_jacobian * root[..., None]).reshape(-1, 7), (white * root).ravel()
+            change = np.linalg.lstsq(flat, -weighted, rcond=None)[0]
             placement = _changed(placement, change, board)
-            if np.abs(change).max() < 1e-10:
+            if np.abs(change).max() < CONVERGED:
                 break
         sigma = float(np.sqrt(np.linalg.pinv(flat.T @ flat)[6, 6]))
         components = centre, pose
-        centre, pose = variance_components(noise, target, flat)
+        centre, pose = variance_components(noise, weighted, flat)
     return PlacedBoard(board, tuple(views), placement, sigma, *components)
 
 
-def placement_sensitivity(
-    place: PlacedBoard, poses: Mapping[int, FloatArray], camera: Camera, config: BoardConfig
-) -> PlacementSensitivity:
-    """How a placement errs with its images and with the poses, at the minimum of its weighted squares."""
-    rows = image_rows(place.views, poses, circle_pixels(place.views, place.model_from_board, poses, camera, config))
-    residuals, jacobian = _similarity_rows(rows, place.model_from_board, place.board, camera)
+def placement_sensitivity(place: PlacedBoard, posed: PosedCamera) -> PlacementSensitivity:
+    """Covariance of a placed board by its images and derivatives by the poses, at the minimum of its cost."""
+    rows = posed.rows(place.views, place.model_from_board)
+    residuals, jacobian = _similarity_rows(rows, place.model_from_board, place.board, posed)
     noise = image_noise(jacobian[:, :, 3:6], rows.groups, place.centre_sigma, place.pose_sigma)
     root = np.sqrt(cauchy_weights(noise.whitened(residuals[..., None])[..., 0]))[:, None, None]
-    points = (place.board.centres @ place.model_from_board[:3, :3].T + place.model_from_board[:3, 3])[rows.circles]
-    by_shift = project_rows(rows, points, camera)[1] @ rows.rotations.transpose(0, 2, 1)
+    points = place.circles_in_model[rows.circles]
+    by_shift = posed.project(rows, points)[1] @ rows.rotations.transpose(0, 2, 1)
     by_turn = by_shift @ -cross_matrices(np.einsum("nij,nj->ni", rows.rotations, points))
     white = noise.whitened(jacobian) * root
     by_pose = noise.whitened(np.concatenate([by_turn, by_shift], axis=-1)) * root
@@ -92,18 +96,18 @@ def placement_sensitivity(
 
 
 def _similarity_rows(
-    rows: CircleRows, placement: FloatArray, board: Board, camera: Camera
+    rows: CircleRows, placement: FloatArray, board: Board, posed: PosedCamera
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals (M, 2) and derivatives (M, 2, 7) by turn, shift and logarithm of size about the board's middle."""
+    """Residuals (M, 2) px and their derivatives (M, 2, 7) by the seven parameters of `PlacementSensitivity`."""
     middle = placement[:3, :3] @ board.centres.mean(0) + placement[:3, 3]
     arms = (board.centres @ placement[:3, :3].T + placement[:3, 3] - middle)[rows.circles]
-    pixels, by_point = project_rows(rows, middle + arms, camera)
+    pixels, by_point = posed.project(rows, middle + arms)
     by_size = by_point @ arms[..., None]
     return pixels - rows.pixels, np.concatenate([by_point @ -cross_matrices(arms), by_point, by_size], axis=-1)
 
 
 def _changed(placement: FloatArray, change: FloatArray, board: Board) -> FloatArray:
-    """The placement changed by the seven parameters of `_similarity_rows`."""
+    """The (4, 4) placement changed by the seven parameters of `PlacementSensitivity`."""
     centre = board.centres.mean(0)
     middle = placement[:3, :3] @ centre + placement[:3, 3]
     changed = np.eye(4)

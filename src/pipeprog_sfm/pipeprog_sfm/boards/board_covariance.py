@@ -1,4 +1,4 @@
-"""How the images of a board err: each circle by itself, and all circles of one image together, by its pose."""
+"""The errors of a board's images: of each circle by itself, and common to all circles of one image, by its pose."""
 
 from __future__ import annotations
 
@@ -9,22 +9,28 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 
-# Errors as expected before any residual is seen, and how many residuals that knowledge is worth: of a centre from
-# fitted edges, and of a pose, in px at the board (its tie points, some 0.3 px each, are many).
-PRIOR_CENTRE = 0.03
-PRIOR_POSE = 0.1
-PRIOR_WEIGHT = 4.0
-CAUCHY = 2.385  # 95 % efficiency for normal errors
-CAUCHY_SQUARE = 0.630  # mean of weight times squared residual, of normal errors in two dimensions, over that without
+PRIOR_CENTRE = 0.03  # px, of a circle's centre: edges known to 0.15 px at 64 points
+PRIOR_POSE = 0.1  # px at the board, of a pose: hundreds of tie points of 0.3 px that share slow errors
+PRIOR_WEIGHT = 4.0  # residuals that these priors count for; more than 2, for the mean of the posterior to exist
+CAUCHY = 2.385  # scale of Cauchy's loss, in sigma: 95 % efficiency for normal errors (Holland, Welsch 1977)
+CAUCHY_SQUARE = 0.630  # mean of weight times squared residual over mean squared residual, normal errors in 2 dimensions
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Covariance of all rows: images are independent, centre^2 I + pose^2 B B^T each; U holds B's left directions."""
+    """Covariance of M rows of G images: images are independent, centre^2 I + pose^2 B B^T each.
+
+    Attributes:
+        groups: (M,) index of the image.
+        directions: (M, 2, 3) left singular vectors U of B, by rows.
+        shares: (G, 3) part of the variance along each direction that is due to the pose.
+        centre: standard deviation of a centre, px.
+        pose: standard deviation that the pose adds, px at the board.
+    """
 
     groups: NDArray[np.intp]
-    directions: FloatArray  # (M, 2, 3) U
-    shares: FloatArray  # (G, 3) part of the variance along each direction that is the pose's
+    directions: FloatArray
+    shares: FloatArray
     centre: float
     pose: float
 
@@ -47,11 +53,11 @@ def image_noise(by_place: FloatArray, groups: NDArray[np.intp], centre: float, p
     products = np.zeros((len(count), 3, 3))
     np.add.at(products, groups, by_place.transpose(0, 2, 1) @ by_place)
     values, vectors = np.linalg.eigh(products)
-    # Unit of the place: a shift of 1 px of all circles, the two larger of the three directions.
+    # Unit of the camera's place: what shifts all circles by 1 px, in the direction of the largest effect.
     values = np.maximum(values, 1e-12 * values[:, 2:])
     directions = by_place @ (vectors / np.sqrt(values)[:, None, :])[groups]
     variances = pose**2 * values * (count / values[:, 2])[:, None]
-    # A single circle has two residuals: its third direction is nought and carries nothing.
+    # A single circle has two residuals: its third direction is zero and has no variance.
     shares = np.where(values > 1e-9 * values[:, 2:], variances / (variances + centre**2), 0.0)
     return Noise(groups, directions * (shares > 0)[groups][:, None, :], shares, centre, pose)
 
@@ -62,10 +68,10 @@ def cauchy_weights(residuals: FloatArray) -> FloatArray:
 
 
 def variance_components(noise: Noise, residuals: FloatArray, jacobian: FloatArray) -> tuple[float, float]:
-    """Standard deviations of a centre and of a pose, px, from whitened, weighted residuals (2M,) and derivatives.
+    """Standard deviations of a centre and of a pose, px, by whitened, weighted residuals (2M,) and derivatives (2M, 7).
 
-    One step of restricted maximum likelihood: each residual counts for a component by its share of the variance,
-    less what the seven parameters absorb of it; the mean of the posterior that starts from the priors.
+    One step of restricted maximum likelihood: each residual counts for a component by the component's share of the
+    variance, less the degrees of freedom that the seven parameters take; mean of the posterior under the priors.
     """
     covariance = np.linalg.pinv(jacobian.T @ jacobian)
     parts = noise.along(jacobian.reshape(-1, 2, 7))

@@ -1,7 +1,7 @@
-"""Target boards placed in the model: from images of known pose, each by a similarity of its own.
+"""Boards placed in the model: a similarity each, from images whose poses are known.
 
-The model is what structure from motion gives: right up to a similarity. Lengths in the model's unit end in nothing,
-metric ones in `_m`.
+The model is that of structure from motion, which is correct up to a similarity. Lengths are in the model's unit, and
+in metres where a name ends in `_m`.
 """
 
 from __future__ import annotations
@@ -21,32 +21,44 @@ from pipeprog_sfm.boards.board_adjustment import adjust_board
 from pipeprog_sfm.boards.board_covariance import PRIOR_CENTRE, PRIOR_POSE
 from pipeprog_sfm.boards.board_detection import detect_predicted_board
 from pipeprog_sfm.boards.ellipses import ImageEllipses
-from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, image_rows, project_rows
+from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, PosedCamera
 from pipeprog_sfm.boards.triangulation import MIN_SINE, midpoints
-from pipeprog_sfm.config import BoardConfig
 
-PARTNER_IMAGES = 6  # images that each image is paired with, near to far, to place a board
-MAX_SIGMA = 0.01  # relative; a scale known worse than that is not published
+START_IMAGES = 40  # images that start a pair, spread over all: enough that some see the board well
+PARTNER_IMAGES = 6  # images that each of them is paired with, near to far
+MAX_SIGMA = 0.01  # relative; a board whose scale is less certain is left out, since others or the odometry know better
+MAX_SCALE_GAP = 0.05  # relative, of a further place of one layout: the model drifts by less, a wrong match by more
+MIN_IMAGES = 2  # for the first place of a layout
+MIN_IMAGES_FURTHER = 3  # for further places: two images may agree on a wrong match by chance
+# Reprojection error up to which an image agrees with a placement: the larger of 3 px, which poses may err by, and a
+# tenth of a circle's radius, which is far from the next circle.
+AGREEMENT_PX = 3.0
+AGREEMENT_RADIUS = 0.1
 
 
 def place_boards(
     observations: Mapping[int, Sequence[BoardObservation]],
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
+    posed: PosedCamera,
     boards: Sequence[Board],
-    config: BoardConfig,
     ellipses: Mapping[int, ImageEllipses] | None,
 ) -> list[PlacedBoard]:
     """Every board at every place where images of known pose agree on it, in the order in which they were seen.
 
-    For every layout of boards a pair of images places it in the model, the other images vote, and the winner is
-    adjusted on all of them with robust weights; what is left over may be another board, or the same one elsewhere.
+    For every layout of boards, pairs of images propose a placement, the other images vote, and the placement with
+    most votes is adjusted on all that agree. The remaining images may show another board of the layout, or the same
+    board elsewhere.
+
+    Args:
+        observations: boards detected, by image stamp [ns].
+        posed: camera and poses; images without a pose are left out.
+        boards: boards to look for.
+        ellipses: all ellipses of the images, by stamp; None uses the observed circles alone.
     """
     placed: list[PlacedBoard] = []
     for group in layouts(boards):
         views = [BoardView(stamp, found) for stamp, seen in sorted(observations.items()) for found in seen]
-        views = [view for view in views if view.stamp in poses and view.seen.board == group[0].name]
-        places = _places(views, poses, camera, group[0], config, ellipses)
+        views = [view for view in views if view.stamp in posed.poses and view.seen.board == group[0].name]
+        places = _places(views, posed, group[0], ellipses)
         for number, place in enumerate(sorted(places, key=lambda place: place.views[0].stamp)):
             placed.append(replace(place, board=group[min(number, len(group) - 1)]))
     order = {board.name: number for number, board in enumerate(boards)}
@@ -54,99 +66,75 @@ def place_boards(
 
 
 def place_circle(
-    board: Board,
-    start: FloatArray,
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    config: BoardConfig,
-    ellipses: Mapping[int, ImageEllipses],
+    board: Board, model_from_board: FloatArray, posed: PosedCamera, ellipses: Mapping[int, ImageEllipses]
 ) -> PlacedBoard:
-    """A board of one circle, of which a place is known already, adjusted on every image that shows it.
+    """A board of one circle, whose place is known roughly, adjusted on every image that shows it.
 
-    One circle fixes neither the turn in its plane nor the size of the model: these stay as `start` (4, 4) has them.
+    One circle fixes neither the turn in its plane nor the size of the model: these stay as (4, 4) model_from_board
+    has them.
     """
-    return _adjusted_on_all(
-        PlacedBoard(board, (), start, 0.0, PRIOR_CENTRE, PRIOR_POSE), poses, camera, config, ellipses
-    )
+    start = PlacedBoard(board, (), model_from_board, 0.0, PRIOR_CENTRE, PRIOR_POSE)
+    return _adjusted_on_all(start, posed, ellipses)
 
 
 def _places(
-    views: list[BoardView],
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    board: Board,
-    config: BoardConfig,
-    ellipses: Mapping[int, ImageEllipses] | None,
+    views: list[BoardView], posed: PosedCamera, board: Board, ellipses: Mapping[int, ImageEllipses] | None
 ) -> list[PlacedBoard]:
     """Places of one layout in the model, each adjusted."""
     places: list[PlacedBoard] = []
-    while len(views) >= 2:
-        start, members = _consensus(views, poses, camera, board)
-        # Two images agree on almost anything: one place may rest on them, further ones need more.
-        if len(members) < (3 if places else 2):
+    while len(views) >= MIN_IMAGES:
+        start, members = _consensus(views, posed, board)
+        if len(members) < (MIN_IMAGES_FURTHER if places else MIN_IMAGES):
             break
         chosen = [views[index] for index in members]
-        place = adjust_board(board, chosen, start, poses, camera, config)
+        place = adjust_board(board, chosen, start, posed)
         if ellipses is not None:
-            place = _adjusted_on_all(place, poses, camera, config, ellipses)
+            place = _adjusted_on_all(place, posed, ellipses)
         taken = {(view.stamp, *centre) for view in place.views for centre in view.seen.ellipse_centres}
         left = [view for index, view in enumerate(views) if index not in members]
         views = [view for view in left if not any((view.stamp, *xy) in taken for xy in view.seen.ellipse_centres)]
-        if place.sigma <= MAX_SIGMA and (not places or abs(place.scale / places[0].scale - 1) < 0.05):
+        if place.sigma <= MAX_SIGMA and (not places or abs(place.scale / places[0].scale - 1) < MAX_SCALE_GAP):
             places.append(place)
     return places
 
 
-def _adjusted_on_all(
-    place: PlacedBoard,
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    config: BoardConfig,
-    ellipses: Mapping[int, ImageEllipses],
-) -> PlacedBoard:
-    """The place adjusted on every image in which a circle of the board is where it must be."""
+def _adjusted_on_all(place: PlacedBoard, posed: PosedCamera, ellipses: Mapping[int, ImageEllipses]) -> PlacedBoard:
+    """The placed board adjusted on every image that has an ellipse where one of its circles is predicted."""
     views = []
-    for stamp in sorted(stamp for stamp in ellipses if stamp in poses):
-        camera_from_board = _metric(poses[stamp] @ place.model_from_board, place.scale)
-        found = detect_predicted_board(ellipses[stamp], place.board, camera, camera_from_board)
+    for stamp in sorted(stamp for stamp in ellipses if stamp in posed.poses):
+        camera_from_board_m = posed.poses[stamp] @ place.model_from_board
+        camera_from_board_m[:3] *= place.scale
+        found = detect_predicted_board(ellipses[stamp], place.board, posed.camera, camera_from_board_m)
         if found is not None:
             views.append(BoardView(stamp, found))
-    return adjust_board(place.board, views, place.model_from_board, poses, camera, config) if len(views) >= 2 else place
+    return adjust_board(place.board, views, place.model_from_board, posed) if len(views) >= MIN_IMAGES else place
 
 
-def _metric(camera_from_board: FloatArray, scale: float) -> FloatArray:
-    """Camera from board with both in metres, from the product of a pose and a similarity."""
-    metric = camera_from_board.copy()
-    metric[:3] *= scale
-    return metric
+def _consensus(views: list[BoardView], posed: PosedCamera, board: Board) -> tuple[FloatArray, list[int]]:
+    """The similarity model_from_board of the pair of images with which most others agree, and indices of these views.
 
-
-def _consensus(
-    views: list[BoardView], poses: Mapping[int, FloatArray], camera: Camera, board: Board
-) -> tuple[FloatArray, list[int]]:
-    """The similarity model_from_board of the pair of images with which most others agree, and who agrees.
-
-    Views of a board that looks the same upside down are turned to agree before they are counted (in place).
+    Views of a board that looks the same upside down are turned to agree with it (in place).
     """
     orders = symmetries(board)
-    rows = image_rows(views, poses, [view.seen.centres for view in views])
-    centres = np.array([-poses[view.stamp][:3, :3].T @ poses[view.stamp][:3, 3] for view in views])
-    limits = np.array([_agreement(view, camera, board) for view in views])[rows.groups]
+    rows = posed.rows_at(views, [view.seen.centres for view in views])
+    limits = np.array([_agreement(view, posed.camera, board) for view in views])[rows.groups]
     best, best_score = np.eye(4), (0, 0.0)
     best_inliers: NDArray[np.bool_] = np.zeros((len(orders), len(views)), bool)
-    for first in np.unique(np.linspace(0, len(views) - 1, 40).astype(int)):
-        # The far ones triangulate best, but may see an equal board elsewhere: the near ones see the same.
-        by_distance = np.argsort(np.linalg.norm(centres - centres[first], axis=1), kind="stable")[1:]
-        partners = by_distance[np.unique(np.linspace(0, len(by_distance) - 1, PARTNER_IMAGES).astype(int))]
-        for partner, order in product(partners.tolist(), orders):
-            start = _from_pair(rows, int(first), partner, order, camera, board)
-            if start is None:
-                continue
-            errors = np.stack([_errors(rows, start, board, camera, turn[rows.circles]) for turn in orders])
-            inliers = np.stack([_all_in_group(error <= limits, rows.groups, len(views)) for error in errors])
-            score = (int(inliers.any(0).sum()), -float(np.minimum(errors.min(0), limits).sum()))
-            if score > best_score:
-                best, best_inliers, best_score = start, inliers, score
+    for (first, partner), order in product(_image_pairs(views, posed), orders):
+        start = _from_pair(rows, (first, partner), order, posed, board)
+        if start is None:
+            continue
+        points = board.centres @ start[:3, :3].T + start[:3, 3]
+        errors = np.stack(
+            [
+                np.linalg.norm(posed.project(rows, points[turn[rows.circles]])[0] - rows.pixels, axis=1)
+                for turn in orders
+            ]
+        )
+        inliers = np.stack([_all_in_group(error <= limits, rows.groups, len(views)) for error in errors])
+        score = (int(inliers.any(0).sum()), -float(np.minimum(errors.min(0), limits).sum()))
+        if score > best_score:
+            best, best_inliers, best_score = start, inliers, score
     members = [int(index) for index in np.flatnonzero(best_inliers.any(0))]
     for index in members:
         turn = orders[best_inliers[:, index].argmax()]
@@ -155,10 +143,21 @@ def _consensus(
     return best, members
 
 
+def _image_pairs(views: Sequence[BoardView], posed: PosedCamera) -> list[tuple[int, int]]:
+    """Pairs of images to triangulate from: distant ones are more precise, near ones see the same of several boards."""
+    centres = np.array([posed.centre(view.stamp) for view in views])
+    pairs = []
+    for first in np.unique(np.linspace(0, len(views) - 1, START_IMAGES).astype(int)):
+        by_distance = np.argsort(np.linalg.norm(centres - centres[first], axis=1), kind="stable")[1:]
+        partners = by_distance[np.unique(np.linspace(0, len(by_distance) - 1, PARTNER_IMAGES).astype(int))]
+        pairs += [(int(first), int(partner)) for partner in partners]
+    return pairs
+
+
 def _agreement(view: BoardView, camera: Camera, board: Board) -> float:
-    """Reprojection error in px up to which an image agrees: a tenth of the radius, and never less than poses err."""
+    """Reprojection error, px, up to which an image agrees with a placement."""
     depth = view.seen.camera_from_board[2, 3]
-    return max(3.0, 0.1 * camera.fx * board.circle_radius / depth)
+    return max(AGREEMENT_PX, AGREEMENT_RADIUS * camera.fx * board.circle_radius / depth)
 
 
 def _all_in_group(good: NDArray[np.bool_], groups: NDArray[np.intp], count: int) -> NDArray[np.bool_]:
@@ -166,14 +165,17 @@ def _all_in_group(good: NDArray[np.bool_], groups: NDArray[np.intp], count: int)
 
 
 def _from_pair(
-    rows: CircleRows, first: int, second: int, order: NDArray[np.intp], camera: Camera, board: Board
+    rows: CircleRows, pair: tuple[int, int], order: NDArray[np.intp], posed: PosedCamera, board: Board
 ) -> FloatArray | None:
-    """model_from_board from the circles that two images share, or None where they do not give it."""
-    one, two = rows.take(rows.groups == first), rows.take(rows.groups == second)
+    """(4, 4) model_from_board from the circles that two images share; None where fewer than three can be triangulated.
+
+    `order` numbers the circles of the second image.
+    """
+    one, two = rows.take(rows.groups == pair[0]), rows.take(rows.groups == pair[1])
     common, in_one, in_two = np.intersect1d(one.circles, order[two.circles], return_indices=True)
-    if first == second or len(common) < 3:
+    if pair[0] == pair[1] or len(common) < 3:
         return None
-    inverse = np.linalg.inv(camera.matrix)
+    inverse = np.linalg.inv(posed.camera.matrix)
     rays, origins = [], []
     for part, chosen in ((one, in_one), (two, in_two)):
         rotations = part.rotations[chosen]
@@ -184,10 +186,3 @@ def _from_pair(
     if sines.min() < MIN_SINE or depths.min() <= 0:
         return None
     return similarity(board.centres[common], points)
-
-
-def _errors(
-    rows: CircleRows, placement: FloatArray, board: Board, camera: Camera, circles: NDArray[np.intp]
-) -> FloatArray:
-    points = board.centres[circles] @ placement[:3, :3].T + placement[:3, 3]
-    return np.linalg.norm(project_rows(rows, points, camera)[0] - rows.pixels, axis=1)

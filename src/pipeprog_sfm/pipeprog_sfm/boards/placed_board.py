@@ -1,4 +1,4 @@
-"""A board at a place of the model, and its images as rows of equations."""
+"""A board placed in the model, the images that show it, and their circles as rows of equations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board, BoardObservation
 from pipeprog_sfm.boards.conic import circle_centre_images
-from pipeprog_sfm.config import BoardConfig
 
 
 @dataclass(frozen=True)
@@ -30,10 +29,10 @@ class PlacedBoard:
     Attributes:
         board: the board.
         views: images of it.
-        model_from_board: (4, 4) similarity, metres on the board to model units.
+        model_from_board: (4, 4) similarity from metres on the board to model units.
         sigma: relative standard deviation of `scale`, from the scatter of the images.
         centre_sigma: standard deviation of a circle's centre, px.
-        pose_sigma: what the poses add to that from image to image, px at the board.
+        pose_sigma: standard deviation that pose errors add, the same for all circles of an image, px at the board.
     """
 
     board: Board
@@ -48,21 +47,24 @@ class PlacedBoard:
         """Metres per model unit."""
         return 1.0 / float(np.cbrt(np.linalg.det(self.model_from_board[:3, :3])))
 
+    @property
+    def circles_in_model(self) -> FloatArray:
+        """(N, 3) centres of the circles, model units."""
+        return self.board.centres @ self.model_from_board[:3, :3].T + self.model_from_board[:3, 3]
+
     def upside_down(self) -> PlacedBoard:
-        """The same, turned by 180 degrees in the board's plane about the middle of its circles."""
-        turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-        turn[:3, 3] = 2 * self.board.centres.mean(0)
-        return replace(self, model_from_board=self.model_from_board @ turn)
+        """The same board, turned by 180 degrees in its plane about the mean of its circles."""
+        return replace(self, model_from_board=self.model_from_board @ self.board.half_turn)
 
 
 @dataclass(frozen=True)
 class CircleRows:
-    """One row for each circle in each image: pixels, what made them, and the image's camera."""
+    """One row for each circle in each image: its pixel, its number, and the pose of the image."""
 
     pixels: FloatArray  # (M, 2)
-    circles: NDArray[np.intp]  # (M,)
+    circles: NDArray[np.intp]  # (M,) row of Board.centres
     groups: NDArray[np.intp]  # (M,) index of the image
-    rotations: FloatArray  # (M, 3, 3)
+    rotations: FloatArray  # (M, 3, 3) camera_from_model
     translations: FloatArray  # (M, 3)
 
     def take(self, chosen: NDArray[np.bool_]) -> CircleRows:
@@ -70,38 +72,54 @@ class CircleRows:
         return CircleRows(*(value[chosen] for value in vars(self).values()))
 
 
-def image_rows(views: Sequence[BoardView], poses: Mapping[int, FloatArray], pixels: Sequence[FloatArray]) -> CircleRows:
-    """Rows of all views; poses (4, 4) camera_from_model by stamp; pixels (K, 2) of the circles of each view."""
-    groups = np.concatenate([np.full(len(view.seen.indices), index) for index, view in enumerate(views)])
-    stack = np.array([poses[view.stamp] for view in views])[groups]
-    circles = np.concatenate([view.seen.indices for view in views])
-    return CircleRows(np.concatenate(pixels), circles, groups, stack[:, :3, :3], stack[:, :3, 3])
+@dataclass(frozen=True)
+class PosedCamera:
+    """A calibrated camera and where it was at each image.
 
+    Attributes:
+        camera: calibration.
+        poses: (4, 4) camera_from_model by stamp [ns], in order of time.
+        eccentricity: whether circle centres are corrected for eccentricity.
+    """
 
-def circle_pixels(
-    views: Sequence[BoardView],
-    placement: FloatArray,
-    poses: Mapping[int, FloatArray],
-    camera: Camera,
-    config: BoardConfig,
-) -> list[FloatArray]:
-    """Images of the circles' centres, freed from eccentricity with the plane of the placement."""
-    if not config.eccentricity:
-        return [view.seen.ellipse_centres for view in views]
-    normal = placement[:3, 2] / np.linalg.norm(placement[:3, 2])
-    return [circle_centre_images(view.seen.conics, camera.matrix, poses[view.stamp][:3, :3] @ normal) for view in views]
+    camera: Camera
+    poses: Mapping[int, FloatArray]
+    eccentricity: bool = True
 
+    def centre(self, stamp: int) -> FloatArray:
+        """(3,) projection centre of an image in the model."""
+        pose = self.poses[stamp]
+        return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
 
-def project_rows(rows: CircleRows, points: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Pixels (M, 2) of model points (M, 3), and derivatives (M, 2, 3) by the points."""
-    x, y, z = (np.einsum("nij,nj->ni", rows.rotations, points) + rows.translations).T
-    z = np.where(z > 1e-9, z, 1e-9)
-    zero = np.zeros_like(z)
-    by_camera = np.stack(
-        [
-            np.stack([camera.fx / z, zero, -camera.fx * x / z**2], -1),
-            np.stack([zero, camera.fy / z, -camera.fy * y / z**2], -1),
-        ],
-        axis=1,
-    )
-    return np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], by_camera @ rows.rotations
+    def rows(self, views: Sequence[BoardView], model_from_board: FloatArray) -> CircleRows:
+        """Circles of all views, their centres corrected for eccentricity with the plane of (4, 4) model_from_board."""
+        if not self.eccentricity:
+            return self.rows_at(views, [view.seen.ellipse_centres for view in views])
+        normal = model_from_board[:3, 2] / np.linalg.norm(model_from_board[:3, 2])
+        pixels = [
+            circle_centre_images(view.seen.conics, self.camera.matrix, self.poses[view.stamp][:3, :3] @ normal)
+            for view in views
+        ]
+        return self.rows_at(views, pixels)
+
+    def rows_at(self, views: Sequence[BoardView], pixels: Sequence[FloatArray]) -> CircleRows:
+        """Circles of all views with pixels (K, 2) of the circles of each view."""
+        groups = np.concatenate([np.full(len(view.seen.indices), index) for index, view in enumerate(views)])
+        stack = np.array([self.poses[view.stamp] for view in views])[groups]
+        circles = np.concatenate([view.seen.indices for view in views])
+        return CircleRows(np.concatenate(pixels), circles, groups, stack[:, :3, :3], stack[:, :3, 3])
+
+    def project(self, rows: CircleRows, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels (M, 2) of model points (M, 3) in the images of the rows, and derivatives (M, 2, 3) by the points."""
+        camera = self.camera
+        x, y, z = (np.einsum("nij,nj->ni", rows.rotations, points) + rows.translations).T
+        z = np.where(z > 1e-9, z, 1e-9)
+        zero = np.zeros_like(z)
+        by_camera = np.stack(
+            [
+                np.stack([camera.fx / z, zero, -camera.fx * x / z**2], -1),
+                np.stack([zero, camera.fy / z, -camera.fy * y / z**2], -1),
+            ],
+            axis=1,
+        )
+        return np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], by_camera @ rows.rotations

@@ -1,4 +1,4 @@
-"""The frame `map`: its origin at the first board that was seen, or at the start, and z up."""
+"""The frame `map`: its origin at the board that was seen first, else at the first camera, and z up."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from pipeprog_sfm.boards.board import symmetries
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.metric.transform_tree import CameraPath
 
-MAX_STEEPNESS = np.cos(np.radians(30.0))  # an axis nearer to the vertical tells no heading
-MAX_DISAGREEMENT = np.radians(5.0)  # of two verticals: more than a board hung by eye or a cheap accelerometer errs by
+MAX_STEEPNESS = np.cos(
+    np.radians(30.0)
+)  # cosine: a board's x axis closer to the vertical than 30 degrees gives no heading, so y is used
+MAX_DISAGREEMENT = np.radians(
+    5.0
+)  # angle of two verticals that is worth a warning; a board hung by eye and an IMU are off by 1 to 2
 
 
 @dataclass(frozen=True)
 class Vertical:
-    """The direction up: (3,) unit vector in the model, and what it is from, for people."""
+    """The direction up: (3,) unit vector in the model, and its source, for people."""
 
     up_in_model: FloatArray
     source: str
 
 
-def board_vertical(place: PlacedBoard, poses: Mapping[int, FloatArray]) -> tuple[PlacedBoard, Vertical, str]:
+def board_vertical(place: PlacedBoard, poses: Mapping[int, FloatArray]) -> tuple[Vertical, str]:
     """The y axis of a board that hangs plumb, and a warning or an empty text.
 
-    A board that looks the same upside down is turned to have its y axis up as the cameras were held.
+    Where the board looks the same upside down, the direction that is up in the images counts.
     """
     up = camera_up({view.stamp: poses[view.stamp] for view in place.views})
     place = _turned_up(place, up)
@@ -40,11 +44,11 @@ def board_vertical(place: PlacedBoard, poses: Mapping[int, FloatArray]) -> tuple
             f"board {place.board.name} hangs {tilt:.0f} degrees off upright as the camera was held, and the map's z "
             "axis with it: hang it upright, or set upright to false"
         )
-    return place, Vertical(axes[:, 1], f"board {place.board.name}"), text
+    return Vertical(axes[:, 1], f"board {place.board.name}"), text
 
 
 def path_vertical(path: CameraPath, poses: Mapping[int, FloatArray]) -> Vertical:
-    """The z axis of the frame that odometry moves in, which REP 103 has up."""
+    """The z axis of the frame that odometry moves in, which is up by REP 103."""
     ups = [
         poses[int(stamp)][:3, :3].T @ pose[2, :3]
         for stamp, pose in zip(path.stamps, path.fixed_from_camera, strict=True)
@@ -62,10 +66,10 @@ def camera_up(poses: Mapping[int, FloatArray]) -> FloatArray:
 def map_from_model(
     scale: float, place: PlacedBoard | None, verticals: Sequence[Vertical], poses: Mapping[int, FloatArray]
 ) -> tuple[FloatArray, str, tuple[str, ...]]:
-    """(4, 4) similarity, what the frame is, and warnings.
+    """(4, 4) similarity map_from_model, a description of the frame for people, and warnings.
 
-    z is the first of the verticals, the others must agree. With a board the origin is its origin and x runs along it,
-    else the origin is the first camera's place and x runs to its right; y points into the scene either way.
+    z is the first of the verticals; others that disagree are warned about. With a board its origin is the origin and
+    x runs along it, else the first camera is the origin and x runs to its right; y points into the scene either way.
 
     Args:
         scale: metres per model unit.
@@ -102,7 +106,7 @@ def _axes(place: PlacedBoard) -> FloatArray:
 
 
 def _turned_up(place: PlacedBoard, up: FloatArray) -> PlacedBoard:
-    """The board with its y axis up, where that cannot be told from upside down."""
+    """The board with its y axis up, turned if need be and if it looks the same upside down."""
     if _axes(place)[:, 1] @ up >= 0 or len(symmetries(place.board)) == 1:
         return place
     return place.upside_down()

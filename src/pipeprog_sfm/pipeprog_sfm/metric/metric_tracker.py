@@ -1,8 +1,8 @@
-"""Boards and motion over a stream of keyframes: look once at each image, estimate whenever the poses move."""
+"""The metric evidence of a stream of keyframes: each image is measured once, the scale estimated at any poses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,23 +14,34 @@ from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.ellipses import ImageEllipses, detect_ellipses
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
-from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
+from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
+from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.scale import NoScaleError, PoseCovariance, ScaleEstimate
+from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, TransformTree
 
 
 class MetricTracker:
-    """Keeps the ellipses and the identified boards of every keyframe, not the images, and what a robot's motion was."""
+    """Holds the ellipses and detected boards of every keyframe, not the images, and what a robot told of its motion.
+
+    Args:
+        board_file: boards, known distances and scale bars.
+        config: how boards are measured.
+        odometry: standard deviations of odometry and rig.
+        sources: what measures the scale; `(*SOURCES, own)` adds a source of one's own.
+    """
 
     def __init__(
         self,
-        targets: BoardFile,
+        board_file: BoardFile,
         config: BoardConfig,
         odometry: OdometryConfig = OdometryConfig(),  # noqa: B008  # frozen
+        sources: Sequence[ScaleSource] = SOURCES,
     ) -> None:
-        self._targets = targets
+        self._board_file = board_file
         self._config = config
         self._odometry = odometry
+        self._sources = sources
         self._camera: Camera | None = None
         self._frame: str | None = None
         self._frames: dict[int, str] = {}
@@ -40,13 +51,13 @@ class MetricTracker:
         self._accelerations: list[Acceleration] = []
 
     def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera, frame: str = "") -> list[BoardObservation]:
-        """Looks for boards in the keyframe of `stamp` [ns] and returns those that it identifies.
+        """Looks for boards in a keyframe and returns those that it finds.
 
         Args:
             stamp: time of the keyframe [ns].
             gray: (H, W) uint8 image as the camera saw it: edges are measured before the lens distortion is removed.
             camera: calibration, the same for every keyframe of one frame.
-            frame: name of the camera's optical frame; targets are measured with the first camera alone.
+            frame: name of the camera's optical frame; boards are measured with the first camera alone.
         """
         self._frames[stamp] = frame
         if self._frame is None:
@@ -55,7 +66,7 @@ class MetricTracker:
             return []
         self._camera = camera
         ellipses = detect_ellipses(gray, camera, self._config)
-        found = detect_boards(ellipses, self._targets.boards, camera)
+        found = detect_boards(ellipses, self._board_file.boards, camera)
         if len(ellipses):
             self._ellipses[stamp] = ellipses
         if found:
@@ -80,11 +91,20 @@ class MetricTracker:
         covariance: PoseCovariance | None = None,
         points: Callable[[], FloatArray] | None = None,
     ) -> ScaleEstimate:
-        """Scale and map frame for (4, 4) poses camera_from_model by stamp; the rest as for `estimate_scale`."""
+        """Scale and map frame at given poses.
+
+        Args:
+            poses: (4, 4) camera_from_model by stamp [ns], in order of time.
+            covariance: of functions of the poses; None takes these for exact.
+            points: gives (N, 3) points of the model, should nothing else tell the vertical.
+
+        Raises:
+            NoScaleError: as `estimate_scale`.
+        """
         if self._camera is None or self._frame is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
-        evidence = ScaleEvidence(
-            self._targets,
+        seen = ScaleEvidence(
+            self._board_file,
             self._observations,
             self._ellipses,
             self._transforms,
@@ -92,4 +112,5 @@ class MetricTracker:
             self._frame,
             self._frames,
         )
-        return estimate_scale(evidence, poses, self._camera, self._config, self._odometry, covariance, points)
+        posed = PosedEvidence(seen, poses, self._camera, self._config, self._odometry, points)
+        return estimate_scale(posed, covariance, self._sources)

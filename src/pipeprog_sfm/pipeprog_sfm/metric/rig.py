@@ -1,4 +1,4 @@
-"""The scale by two cameras on one body: how far apart they are mounted, over how far apart the model has them."""
+"""The scale by a camera rig: the baseline of two cameras as /tf_static has it, over that in the model."""
 
 from __future__ import annotations
 
@@ -8,59 +8,61 @@ from itertools import combinations
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_sfm.boards.board_covariance import CAUCHY
 from pipeprog_sfm.config import OdometryConfig
-from pipeprog_sfm.metric.scale import Measurement
+from pipeprog_sfm.metric.scale import Measurement, ScaleWarning
 from pipeprog_sfm.metric.transform_tree import NoPathError, TransformTree
 
-MAX_SKEW = 1_000_000  # ns between the images of a pair: at a walk the body moves by a millimetre
-MIN_PAIRS = 3  # from which a spread can be told
-CAUCHY = 2.385  # 95 % efficiency for normal errors (Holland, Welsch 1977)
-MAX_MISFIT = 0.3  # median error of a pair over the baseline from which the cameras are not mounted as it is said
+MAX_SKEW = (
+    1_000_000  # ns between the images of a pair: walking at 1 m/s the body moves by 1 mm, far less than a baseline
+)
+MIN_PAIRS = 3  # of images, to estimate a standard deviation from their scatter
+MAX_MISFIT = 0.3  # median error of a pair over the baseline; above, the mounting or the clocks must be wrong
+ROUNDS = 20  # of reweighting, each of which at least halves the distance from the limit: to 1e-6 of it
 
 
 class RigError(Exception):
-    """Two cameras tell no scale; the text says why."""
+    """Two cameras give no scale; the text says why."""
 
 
 def rig_measurements(
     frames: Mapping[int, str], transforms: TransformTree, poses: Mapping[int, FloatArray], config: OdometryConfig
-) -> tuple[list[Measurement], list[str]]:
-    """The scale by each two cameras of one body, and why others tell none.
+) -> list[Measurement | ScaleWarning]:
+    """The scale by each two cameras of one body; a warning for two that do not give it.
 
     Args:
         frames: optical frame of each image, by stamp [ns].
         transforms: static ones lead from one camera to the other.
         poses: (4, 4) camera_from_model by stamp, in order of time.
-        config: how good the mounting is known.
+        config: standard deviation of the baseline.
     """
-    measurements, warnings = [], []
+    found: list[Measurement | ScaleWarning] = []
     for one, other in combinations(sorted(set(frames.values())), 2):
         try:
             one_from_other = transforms.static_transform(one, other)
-            measurements.append(_measurement(one, other, one_from_other, frames, poses, config))
+            found.append(_measurement((one, other), one_from_other, frames, poses, config))
         except (NoPathError, RigError) as error:
-            warnings.append(str(error))
-    return measurements, warnings
+            found.append(ScaleWarning(str(error)))
+    return found
 
 
 def _measurement(
-    one: str,
-    other: str,
+    cameras: tuple[str, str],
     one_from_other: FloatArray,
     frames: Mapping[int, str],
     poses: Mapping[int, FloatArray],
     config: OdometryConfig,
 ) -> Measurement:
-    """The robust mean of what each pair of images shows of the baseline, along the baseline.
+    """The robust mean, over pairs of images, of the model's baseline projected on the given one.
 
-    The model's baseline projected on the true one errs evenly to both sides; its length would be too long.
+    Noise of the poses leaves the projection unbiased; the length of the model's baseline would be too long.
     """
-    names = f"the cameras '{one}' and '{other}'"
+    names = "the cameras '{}' and '{}'".format(*cameras)
     baseline = one_from_other[:3, 3]
     length = float(np.linalg.norm(baseline))
     if MAX_MISFIT * length < config.baseline_sigma:
-        raise RigError(f"{names} are as good as in one place, says /tf_static: they tell no scale")
-    pairs = _pairs(one, other, frames, poses)
+        raise RigError(f"{names} are at one place by /tf_static: they give no scale")
+    pairs = _pairs(cameras, frames, poses)
     if len(pairs) < MIN_PAIRS:
         raise RigError(
             f"{len(pairs)} images of {names} are of one moment (within {MAX_SKEW * 1e-6:g} ms): too few for a scale"
@@ -73,7 +75,7 @@ def _measurement(
     if np.median(np.linalg.norm(scale * found - baseline, axis=1)) > MAX_MISFIT * length:
         raise RigError(f"{names} are not mounted as /tf_static says, or their clocks do not agree")
     mean = float(np.median(along))
-    for _ in range(20):
+    for _ in range(ROUNDS):
         square = (along - mean) ** 2
         spread = max(1.4826 * float(np.median(np.sqrt(square))), 1e-9 * mean)
         weight = 1.0 / (1.0 + square / (CAUCHY * spread) ** 2)
@@ -85,11 +87,11 @@ def _measurement(
     )
 
 
-def _pairs(one: str, other: str, frames: Mapping[int, str], poses: Mapping[int, FloatArray]) -> list[tuple[int, int]]:
-    """Stamps of images of one moment, each used once at most."""
-    first, second = (
-        np.array([stamp for stamp in poses if frames.get(stamp) == name], np.int64) for name in (one, other)
-    )
+def _pairs(
+    cameras: tuple[str, str], frames: Mapping[int, str], poses: Mapping[int, FloatArray]
+) -> list[tuple[int, int]]:
+    """Stamps of images taken within MAX_SKEW, each used once at most."""
+    first, second = (np.array([stamp for stamp in poses if frames.get(stamp) == name], np.int64) for name in cameras)
     if not len(first) or not len(second):
         return []
     gap = np.abs(first[:, None] - second[None])

@@ -13,7 +13,8 @@ from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile, ScaleBar
 from pipeprog_sfm.config import BoardConfig
-from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
+from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
+from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.scale import NoScaleError
 
 CONFIG = BoardConfig()
@@ -41,7 +42,7 @@ def floor(walk):
 def estimate(walk, targets):
     seen = {stamp: detect_boards(ellipses, targets.boards, CAMERA) for stamp, ellipses in walk.ellipses.items()}
     evidence = ScaleEvidence(targets, seen, walk.ellipses)
-    return estimate_scale(evidence, walk.poses, CAMERA, CONFIG, points=lambda: floor(walk))
+    return estimate_scale(PosedEvidence(evidence, walk.poses, CAMERA, CONFIG, points=lambda: floor(walk)))
 
 
 @settings(max_examples=8, deadline=None)

@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 from targets import CAMERA
 
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
-from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
+from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
+from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.rig import rig_measurements
+from pipeprog_sfm.metric.scale import ScaleWarning
 from pipeprog_sfm.metric.transform_tree import Transform, TransformTree
 from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
 from tests.unit.sfm.metric.test_transform_tree import SECOND, Robot, pose_of, random_pose
@@ -44,7 +46,9 @@ class Pair(Robot):
         return tree
 
     def measured(self, tree=None, config=PERFECT):
-        return rig_measurements(self.frames, self.mounted() if tree is None else tree, self.poses, config)
+        found = rig_measurements(self.frames, self.mounted() if tree is None else tree, self.poses, config)
+        warnings = [each.text for each in found if isinstance(each, ScaleWarning)]
+        return [each for each in found if not isinstance(each, ScaleWarning)], warnings
 
 
 def test_an_exact_rig_gives_the_exact_scale():
@@ -107,7 +111,7 @@ def test_what_is_wrong_is_told():
     turned = pose_of(Rotation.identity(), [0.0, 0.2, 0.0])
     assert "not mounted as /tf_static says" in pair.measured(pair.mounted(turned))[1][0]
     assert "no static transform connects" in pair.measured(TransformTree())[1][0]
-    assert "as good as in one place" in pair.measured(pair.mounted(np.eye(4)), OdometryConfig())[1][0]
+    assert "are at one place by /tf_static" in pair.measured(pair.mounted(np.eye(4)), OdometryConfig())[1][0]
     assert "0 images" in Pair(4, skew=SECOND // 20).measured()[1][0]
 
 
@@ -118,7 +122,7 @@ def test_a_rig_is_weighed_against_odometry():
         tree.add([Transform(0, "camera", "right", LEFT_FROM_RIGHT, True)])
         evidence = ScaleEvidence(transforms=tree, camera_frame="camera", frames=pair.frames)
         config = replace(BoardConfig(), upright=False)
-        estimate = estimate_scale(evidence, pair.poses, CAMERA, config, OdometryConfig())
+        estimate = estimate_scale(PosedEvidence(evidence, pair.poses, CAMERA, config))
         assert estimate.source == "rig+odometry"
         assert any("off that of" in warning for warning in estimate.warnings) == disagree
         if not disagree:

@@ -8,12 +8,16 @@ from targets import BOARD, CAMERA, LOPSIDED, Walk, camera_from_board, exact_elli
 
 from pipeprog_camera.similarity import similarity
 from pipeprog_sfm.boards.board import Board
+from pipeprog_sfm.boards.board_check import circle_residuals
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile, KnownDistance
+from pipeprog_sfm.boards.placed_board import PosedCamera
 from pipeprog_sfm.config import BoardConfig
-from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
+from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
+from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
-from pipeprog_sfm.metric.scale import NoScaleError
+from pipeprog_sfm.metric.scale import Measurement, NoScaleError, ScaleWarning
+from pipeprog_sfm.metric.scale_sources import SOURCES
 from pipeprog_sfm.metric.vertical_from_planes import PlanesError, vertical_from_planes
 from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covariance
 
@@ -22,7 +26,8 @@ CONFIG = BoardConfig()
 
 def told(walk, boards=(BOARD,), config=CONFIG, distances=()):
     seen = {stamp: detect_boards(ellipses, boards, CAMERA) for stamp, ellipses in walk.ellipses.items()}
-    return estimate_scale(ScaleEvidence(BoardFile(boards, distances), seen, walk.ellipses), walk.poses, CAMERA, config)
+    evidence = ScaleEvidence(BoardFile(boards, distances), seen, walk.ellipses)
+    return estimate_scale(PosedEvidence(evidence, walk.poses, CAMERA, config))
 
 
 @settings(max_examples=8, deadline=None)
@@ -36,7 +41,31 @@ def test_exact_images_give_the_exact_scale_and_frame(seed):
     assert board_in_map == pytest.approx(
         np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]), abs=1e-5
     )
-    assert estimate.placements[0].ratio_scale == pytest.approx(estimate.scale, rel=1e-6)
+    # The paper's Eq. 2, the ratio of the spreads of given and triangulated centres, gives the same scale.
+    residuals = circle_residuals(estimate.boards[0], PosedCamera(CAMERA, walk.poses))
+    triangulated = Board("A", BOARD.circle_radius, BOARD.centres + residuals.offsets)
+    assert estimate.scale * BOARD.spread / triangulated.spread == pytest.approx(estimate.scale, rel=1e-6)
+
+
+def test_a_source_of_ones_own_is_combined_with_the_others():
+    walk = Walk(2, noise=0.05, pose_noise=0.0003)
+
+    def laser(posed):
+        return [Measurement.of_trajectory("laser", "the laser", 1.01 / walk.factor, 1e-5, posed.poses)]
+
+    def silent(posed):
+        return [ScaleWarning("the GNSS has no fix", "no_fix")]
+
+    seen = {stamp: detect_boards(ellipses, (BOARD,), CAMERA) for stamp, ellipses in walk.ellipses.items()}
+    posed = PosedEvidence(ScaleEvidence(BoardFile((BOARD,)), seen, walk.ellipses), walk.poses, CAMERA)
+    estimate = estimate_scale(posed, sources=(*SOURCES, laser, silent))
+    assert estimate.source == "board+laser"
+    assert estimate.scale * walk.factor == pytest.approx(1.01, abs=1e-3)
+    assert any("off that of the laser" in text for text in estimate.warnings)
+    assert "the GNSS has no fix" in estimate.warnings
+    with pytest.raises(NoScaleError, match="no fix") as caught:
+        estimate_scale(posed, sources=(silent,))
+    assert caught.value.reason == "no_fix"
 
 
 def test_sigma_is_honest_at_the_noise_of_a_good_model():
@@ -44,8 +73,8 @@ def test_sigma_is_honest_at_the_noise_of_a_good_model():
     scores = []
     for seed in range(24):
         walk = Walk(seed, views=8, noise=0.1, pose_noise=0.0005)
-        placement = told(walk).placements[0]
-        scores.append((placement.scale * walk.factor - 1) / placement.sigma)
+        place = told(walk).boards[0]
+        scores.append((place.scale * walk.factor - 1) / place.sigma)
     assert 0.4 < np.mean(np.square(scores)) < 2.0
     assert np.abs(scores).max() < 4.0
 
@@ -53,7 +82,7 @@ def test_sigma_is_honest_at_the_noise_of_a_good_model():
 def test_sigma_holds_the_tolerance_of_the_board():
     walk = Walk(1, noise=0.05, pose_noise=0.0003)
     coarse = told(walk, config=replace(CONFIG, tolerance=0.002))
-    assert coarse.sigma == pytest.approx(np.hypot(coarse.placements[0].sigma, 0.002 / BOARD.spread))
+    assert coarse.sigma == pytest.approx(np.hypot(coarse.boards[0].sigma, 0.002 / BOARD.spread))
 
 
 def test_uncorrected_centres_are_off_by_the_eccentricity():
@@ -87,9 +116,9 @@ def test_boards_of_one_layout_are_told_apart_by_place():
     twins = (BOARD, replace(BOARD, name="twin"))
     walk = Walk(4, views=12, noise=0.03, pose_noise=0.0003, span=3.0, boards=((BOARD, np.eye(4)), (BOARD, apart)))
     estimate = told(walk, twins)
-    assert sorted(one.board for one in estimate.placements) == ["A", "twin"]
+    assert sorted(one.board.name for one in estimate.boards) == ["A", "twin"]
     assert estimate.scale * walk.factor == pytest.approx(1.0, abs=5e-4)
-    gap = estimate.placements[1].model_from_board[:3, 3] - estimate.placements[0].model_from_board[:3, 3]
+    gap = estimate.boards[1].model_from_board[:3, 3] - estimate.boards[0].model_from_board[:3, 3]
     assert np.linalg.norm(gap) * estimate.scale == pytest.approx(0.8, abs=0.001)
 
 
@@ -100,7 +129,7 @@ def test_equal_boards_at_both_ends_of_a_walk_are_told_apart():
         5, views=24, noise=0.03, pose_noise=0.0003, span=7.0, follow=1.0, boards=((BOARD, left), (BOARD, right))
     )
     estimate = told(walk, (BOARD, replace(BOARD, name="twin")))
-    assert sorted(one.board for one in estimate.placements) == ["A", "twin"]
+    assert sorted(one.board.name for one in estimate.boards) == ["A", "twin"]
     assert estimate.scale * walk.factor == pytest.approx(1.0, abs=5e-4)
 
 
@@ -152,7 +181,7 @@ def test_the_origin_stays_at_the_board_that_was_seen_first():
     walk = far_apart(4)
     for boards in ((BOARD, LOPSIDED), (LOPSIDED, BOARD)):
         estimate = told(walk, boards)
-        assert estimate.placements[0].board == "A"
+        assert estimate.boards[0].board.name == "A"
         origin = estimate.map_from_model @ walk.model_from_board @ [-3.0, 0.0, 0.0, 1.0]
         assert origin[:3] == pytest.approx(np.zeros(3), abs=0.002)
 
@@ -179,7 +208,7 @@ def test_of_two_boards_the_bent_one_is_refused_and_the_other_counts():
     boards = ((BOARD, np.eye(4)), (Board("B", LOPSIDED.circle_radius, centres), right))
     walk = Walk(3, views=14, noise=0.03, pose_noise=0.0003, span=3.0, follow=1.0, boards=boards)
     estimate = told(walk, (BOARD, LOPSIDED))
-    assert [place.board for place in estimate.placements] == ["A"]
+    assert [place.board.name for place in estimate.boards] == ["A"]
     assert "board B contradicts its file" in estimate.warnings[0]
     assert "3: " in estimate.warnings[0]
     assert abs(estimate.scale * walk.factor - 1) < 4 * estimate.sigma
@@ -208,9 +237,8 @@ def test_floor_and_walls_tell_what_is_up(surfaces):
     points = room(rng, surfaces) @ walk.model_from_board[:3, :3].T + walk.model_from_board[:3, 3]
     seen = {stamp: detect_boards(ellipses, (BOARD,), CAMERA) for stamp, ellipses in walk.ellipses.items()}
     config = replace(CONFIG, upright=False)
-    estimate = estimate_scale(
-        ScaleEvidence(BoardFile((BOARD,)), seen, walk.ellipses), walk.poses, CAMERA, config, points=lambda: points
-    )
+    evidence = ScaleEvidence(BoardFile((BOARD,)), seen, walk.ellipses)
+    estimate = estimate_scale(PosedEvidence(evidence, walk.poses, CAMERA, config, points=lambda: points))
     up = (estimate.map_from_model @ walk.model_from_board)[:3, 1]
     assert np.degrees(np.arccos(up @ [0, 0, 1] / np.linalg.norm(up))) < 0.5
     assert "floor and walls" in estimate.frame
@@ -226,7 +254,7 @@ def test_one_wall_or_a_cloud_of_nothing_tell_no_vertical():
 def test_reasons_for_no_scale():
     walk = Walk(8)
     with pytest.raises(NoScaleError, match="nothing tells the scale") as caught:
-        estimate_scale(ScaleEvidence(), walk.poses, CAMERA, CONFIG)
+        estimate_scale(PosedEvidence(ScaleEvidence(), walk.poses, CAMERA, CONFIG))
     with pytest.raises(NoScaleError, match="B") as caught:
         told(walk, (LOPSIDED,))
     assert caught.value.reason == "no_board"
@@ -295,7 +323,7 @@ class DriftingWalk:
     def score(self, covariance):
         """Error of the scale over its standard deviation."""
         config = replace(CONFIG, tolerance=0.0)
-        estimate = estimate_scale(self.evidence, self.poses, CAMERA, config, covariance=covariance)
+        estimate = estimate_scale(PosedEvidence(self.evidence, self.poses, CAMERA, config), covariance)
         return np.log(estimate.scale / self.true_scale) / estimate.sigma
 
 

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from targets import CAMERA
 
-from pipeprog_sfm.config import BoardConfig, OdometryConfig
+from pipeprog_sfm.config import OdometryConfig
+from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.gravity import STANDARD_GRAVITY, GravityError, gravity
-from pipeprog_sfm.metric.metric_frame import ScaleEvidence, estimate_scale
+from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.metric.scale import NoScaleError
 from pipeprog_sfm.metric.transform_tree import Acceleration, CameraPath, NoPathError, Transform, TransformTree
@@ -201,12 +202,10 @@ def test_an_imu_that_counts_in_g_is_told():
 
 def test_odometry_alone_makes_a_metric_map_with_z_up():
     robot = Robot(4)
-    estimate = estimate_scale(
-        ScaleEvidence(transforms=robot.tree(noise=0.002), accelerations=robot.accelerations(), camera_frame="camera"),
-        robot.poses,
-        CAMERA,
-        BoardConfig(),
+    evidence = ScaleEvidence(
+        transforms=robot.tree(noise=0.002), accelerations=robot.accelerations(), camera_frame="camera"
     )
+    estimate = estimate_scale(PosedEvidence(evidence, robot.poses, CAMERA))
     assert estimate.source == "odometry"
     assert abs(np.log(estimate.scale * robot.factor)) < 3 * estimate.sigma
     assert estimate.warnings == ()
@@ -223,4 +222,4 @@ def test_what_is_missing_is_told():
     tree = TransformTree()
     tree.add([Transform(0, "odom", "base", np.eye(4))])
     with pytest.raises(NoScaleError, match=r"nothing tells the scale.*no transform leads.*/tf_static"):
-        estimate_scale(ScaleEvidence(transforms=tree, camera_frame="camera"), robot.poses, CAMERA, BoardConfig())
+        estimate_scale(PosedEvidence(ScaleEvidence(transforms=tree, camera_frame="camera"), robot.poses, CAMERA))
