@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -19,38 +19,68 @@ from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
 from pipeprog_frames.feedback import OverlapReport
 from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
-from pipeprog_frames.image_network import ImageNetwork
+from pipeprog_frames.ledger import MAX_AHEAD, Answer, Ledger
+from pipeprog_frames.policy import Policy, make_policy
 from pipeprog_frames.selector import DAMAGED, Decision, Load
 from pipeprog_frames.stream import KeyframeStream
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.discovery import stages_subscribed
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 
-MAX_QUEUE = 30  # one second of a fast camera; more would only be late
-LISTENERS = 2  # in lockstep: SfM and detector, without whom the first keyframe would be lost
-MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
+MAX_QUEUE = 30  # frames that wait, live: one second of a fast camera; older ones would only be late
+STAGES = 2  # nodes of the graph that take keyframes: SfM and detector
 
 
-class Policy(Protocol):
-    """What decides: Stream or Network."""
+class KeyframePublisher:
+    """The topics of the selector: decisions, keyframes with their calibration, retirements."""
 
-    def consider(self, stamp: int, load: Load | None) -> list[Decision]:
-        """Takes the next frame."""
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._decisions = node.create_publisher(FrameDecision, "frame_decisions", qos.reliable(1000))
+        self._images = node.create_publisher(CompressedImage, "keyframes/image/compressed", qos.reliable(50))
+        self._infos = node.create_publisher(CameraInfo, "keyframes/camera_info", qos.reliable(50))
+        self._retired = node.create_publisher(KeyframesRetired, "keyframes/retired", qos.reliable(50))
 
-    def flush(self) -> list[Decision]:
-        """Decides on the frames that are still open."""
+    @property
+    def is_connected(self) -> bool:
+        """Whether SfM and detector receive keyframes: what is published before is lost. Viewers do not count."""
+        topics = (self._images, self._infos)
+        return all(
+            topic.get_subscription_count() >= STAGES and len(stages_subscribed(self._node, topic.topic_name)) >= STAGES
+            for topic in topics
+        )
 
-    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
-        """Takes the SfM's answers."""
+    def announce(self, decision: Decision, frame_id: str) -> None:
+        """Publishes what became of a frame."""
+        self._decisions.publish(
+            FrameDecision(
+                header=messages.header(decision.stamp, frame_id),
+                chosen=decision.chosen,
+                reason=decision.reason,
+                overlap=float(decision.overlap),
+                parallax=float(decision.parallax),
+                sharpness=float(decision.sharpness),
+            )
+        )
 
-    def finish_round(self) -> list[Decision]:
-        """What to change when all frames have come and the SfM has answered to all keyframes; nothing: the end."""
+    def publish(self, frame: EncodedFrame) -> None:
+        """Publishes a keyframe."""
+        self._images.publish(messages.compressed_image(frame.stamp, frame.frame_id, frame.encoded))
+        self._infos.publish(messages.info_from_camera(frame.camera, frame.stamp, frame.frame_id))
 
-    def report_outside_band(self) -> list[Decision]:
-        """What is to be said of single keyframes in the end."""
+    def retire(self, stamps: Sequence[int], published: Sequence[int], frame_id: str) -> None:
+        """Takes keyframes back; the SfM applies it after as many keyframes as are `published`."""
+        self._retired.publish(
+            KeyframesRetired(
+                header=messages.header(max(published), frame_id),
+                keyframes_published=len(published),
+                stamps=[messages.time_msg(stamp) for stamp in stamps],
+            )
+        )
 
 
 class FramesNode(Node):
@@ -66,19 +96,14 @@ class FramesNode(Node):
         # In a replay the disk that holds the recording can hold its images, too.
         self._ring: FrameStore = FrameFile() if self._config.lockstep else FrameRing(self._config.buffer_mib << 20)
         self._queue: deque[Image | CompressedImage] = deque()
-        self._changes: deque[EncodedFrame | list[Decision]] = deque()  # keyframes to publish, keyframes to retire
-        self._feedback: deque[ImageOverlapArray] = deque()
-        self._published: list[int] = []  # stamps in the order of publication
-        self._acknowledged = self._retirements = self._acknowledged_retirements = self._lag = 0
+        self._changes: deque[EncodedFrame | list[int]] = deque()  # keyframes to publish; stamps of some to retire
+        self._ledger = Ledger()
         self._considered = self._damaged = self._dropped = 0
         self._finish: tuple[int, Future] | None = None
         self._flushed = False
         self._frame_id = ""  # of the camera, as its last image says
 
-        self._decisions = self.create_publisher(FrameDecision, "frame_decisions", qos.reliable(1000))
-        self._images = self.create_publisher(CompressedImage, "keyframes/image/compressed", qos.reliable(50))
-        self._infos = self.create_publisher(CameraInfo, "keyframes/camera_info", qos.reliable(50))
-        self._retired = self.create_publisher(KeyframesRetired, "keyframes/retired", qos.reliable(50))
+        self._publisher = KeyframePublisher(self)
         # Live, a late image is worth less than a fresh one; a recording must lose none.
         source = qos.reliable(MAX_QUEUE) if self._config.lockstep else qos.sensor(10)
         subscribe = partial(self.create_subscription, qos_profile=source, qos_overriding_options=qos.OVERRIDABLE)
@@ -104,14 +129,8 @@ class FramesNode(Node):
             return
         if camera != self._camera:
             self._camera = camera
-            self._policy = self._policy or self._make_policy(camera)
+            self._policy = self._policy or make_policy(self._config, camera, self._ring.sharpest_between)
         self._drain()
-
-    def _make_policy(self, camera: Camera) -> Policy:
-        overlap_min = self._config.overlap_min
-        if self._config.policy == "network":
-            return ImageNetwork(overlap_min, overlap_min + self._config.overlap_band, self._ring.sharpest_between)
-        return KeyframeStream(self._config, camera, self._ring.sharpest_between)
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         self._queue.append(message)
@@ -131,25 +150,15 @@ class FramesNode(Node):
             self._drain()
 
     def _is_connected(self) -> bool:
-        """Whether the SfM and the detector hear the keyframes: what is published before is never heard."""
-        listeners = min(self._images.get_subscription_count(), self._infos.get_subscription_count())
-        return listeners >= LISTENERS and self._overlaps.get_publisher_count() > 0
+        return self._publisher.is_connected and self._overlaps.get_publisher_count() > 0
 
     def _on_overlap(self, message: ImageOverlapArray) -> None:
-        self._acknowledged = max(self._acknowledged, message.keyframes_considered)
-        self._acknowledged_retirements = max(self._acknowledged_retirements, message.retirements_considered)
-        self._feedback.append(message)
+        self._ledger.receive(_answer(message))
         if not self._config.lockstep:
-            self._apply_feedback(message.keyframes_considered)
-            self._measure_lag(messages.stamp_ns(message.header.stamp))
+            self._apply_reports(message.keyframes_considered)
+            if isinstance(self._policy, KeyframeStream):
+                self._policy.lag(self._ledger.lag)
         self._drain()
-
-    def _measure_lag(self, answered: int) -> None:
-        """How far the SfM is behind, by the keyframe that it has answered to: a count would not forgive a lost one."""
-        if answered in self._published:
-            self._lag = len(self._published) - 1 - self._published.index(answered)
-        if isinstance(self._policy, KeyframeStream):
-            self._policy.lag(self._lag)
 
     async def _on_finish(self, request: Finish.Request, response: Finish.Response) -> Finish.Response:
         done: Future = Future()
@@ -157,13 +166,14 @@ class FramesNode(Node):
         self._flushed = False
         self._drain()
         await done
-        response.success = bool(self._published)
-        response.message = "" if self._published else "no image could be used as a keyframe: see frame_decisions"
-        response.outputs = len(self._published)
+        published = len(self._ledger.published)
+        response.success = published > 0
+        response.message = "" if published else "no image could be used as a keyframe: see frame_decisions"
+        response.outputs = published
         return response
 
     def _drain(self) -> None:
-        """Works off what can be worked off now; called on every arrival."""
+        """Considers, publishes and finishes as far as the SfM's answers allow; called on every arrival."""
         while self._publish_changes() and self._queue and self._policy is not None:
             self._consider(self._queue.popleft())
         if self._finish is None or self._considered < self._finish[0]:
@@ -171,8 +181,8 @@ class FramesNode(Node):
         if self._policy is not None and not self._flushed:
             self._flushed = True
             self._decide(self._policy.flush())
-        while self._publish_changes() and self._is_answered():
-            self._apply_feedback(len(self._published))
+        while self._publish_changes() and self._ledger.is_answered:
+            self._apply_reports(len(self._ledger.published))
             if self._policy is not None:
                 self._revise(self._policy.finish_round())
             if not self._changes:
@@ -181,17 +191,14 @@ class FramesNode(Node):
 
     def _end(self) -> None:
         assert self._finish is not None
-        verdict = self._policy.report_outside_band() if self._policy is not None else []
-        for decision in verdict:
-            self._announce(decision)
-        if verdict:
-            self.get_logger().info(f"{len(verdict)} keyframes are outside the band: frame_decisions has the reasons")
+        outside = self._policy.report_outside_band() if self._policy is not None else []
+        for decision in outside:
+            self._publisher.announce(decision, self._frame_id)
+        if outside:
+            self.get_logger().info(f"{len(outside)} keyframes are outside the band: frame_decisions has the reasons")
         done = self._finish[1]
         self._finish = None
         done.set_result(None)
-
-    def _is_answered(self) -> bool:
-        return self._acknowledged >= len(self._published) and self._acknowledged_retirements >= self._retirements
 
     def _consider(self, message: Image | CompressedImage) -> None:
         assert self._camera is not None
@@ -234,75 +241,46 @@ class FramesNode(Node):
         """Announces what became of frames and queues those that were chosen."""
         for decision in decisions:
             self._damaged += decision.reason == DAMAGED
-            self._announce(decision)
+            self._publisher.announce(decision, self._frame_id)
             frame = self._ring.get(decision.stamp) if decision.chosen else None
             if frame is not None:
                 self._changes.append(frame)
 
     def _revise(self, decisions: list[Decision]) -> None:
-        """Announces second thoughts: frames to be added, and keyframes to be retired."""
+        """Queues what the overlap reports ask for: frames to add, and keyframes to retire."""
         self._decide(decisions)
-        retired = [decision for decision in decisions if not decision.chosen]
+        retired = [decision.stamp for decision in decisions if not decision.chosen]
         if retired:
             self._changes.append(retired)
 
-    def _announce(self, decision: Decision) -> None:
-        self._decisions.publish(
-            FrameDecision(
-                header=messages.header(decision.stamp, self._frame_id),
-                chosen=decision.chosen,
-                reason=decision.reason,
-                overlap=float(decision.overlap),
-                parallax=float(decision.parallax),
-                sharpness=float(decision.sharpness),
-            )
-        )
-
     def _publish_changes(self) -> bool:
-        """Publishes what is chosen and retired; False while the SfM must catch up first (lockstep)."""
+        """Publishes what is queued; False while the SfM must catch up first (lockstep)."""
         while self._changes:
             if self._config.lockstep:
-                if not self._published and not self._is_connected():
+                published = len(self._ledger.published)
+                if not self._ledger.may_publish or (not published and not self._is_connected()):
                     return False
-                if self._acknowledged_retirements < self._retirements:
-                    return False
-                if len(self._published) - self._acknowledged >= MAX_AHEAD:
-                    return False
-                self._apply_feedback(len(self._published) + 1 - MAX_AHEAD)
+                self._apply_reports(published + 1 - MAX_AHEAD)
             change = self._changes.popleft()
             if isinstance(change, EncodedFrame):
-                self._publish(change)
+                self._ledger.publish(change.stamp)
+                self._publisher.publish(change)
             else:
-                self._retire(change)
+                self._ledger.retire()
+                self._publisher.retire(change, self._ledger.published, self._frame_id)
         return True
 
-    def _publish(self, frame: EncodedFrame) -> None:
-        self._published.append(frame.stamp)
-        self._images.publish(messages.compressed_image(frame.stamp, frame.frame_id, frame.encoded))
-        self._infos.publish(messages.info_from_camera(frame.camera, frame.stamp, frame.frame_id))
-
-    def _retire(self, decisions: list[Decision]) -> None:
-        self._retirements += 1
-        self._retired.publish(
-            KeyframesRetired(
-                header=messages.header(max(self._published), self._frame_id),
-                keyframes_published=len(self._published),
-                stamps=[messages.time_msg(decision.stamp) for decision in decisions],
-            )
-        )
-
-    def _apply_feedback(self, count: int) -> None:
-        """Uses the SfM's answers to the first `count` keyframes; later ones wait, so that a replay repeats itself."""
-        while self._feedback and self._feedback[0].keyframes_considered <= count:
-            reports = [_report(image) for image in self._feedback.popleft().images]
+    def _apply_reports(self, keyframes: int) -> None:
+        """Uses the answers to the first `keyframes` keyframes; later ones wait, so that a replay repeats itself."""
+        for reports in self._ledger.reports(keyframes):
             if self._policy is not None:
                 self._revise(self._policy.answer(reports))
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         values = {
             "frames considered": self._considered,
-            "keyframes": len(self._published),
-            "keyframes that the SfM is behind": self._lag,
+            "keyframes": len(self._ledger.published),
+            "keyframes that the SfM is behind": self._ledger.lag,
             "damaged": self._damaged,
             "dropped": self._dropped,
             "queued": len(self._queue),
@@ -315,6 +293,15 @@ class FramesNode(Node):
         if self._dropped:
             return DiagnosticStatus.WARN, "frames were dropped: the machine cannot keep up", values
         return DiagnosticStatus.OK, "selecting", values
+
+
+def _answer(message: ImageOverlapArray) -> Answer:
+    return Answer(
+        messages.stamp_ns(message.header.stamp),
+        message.keyframes_considered,
+        message.retirements_considered,
+        tuple(_report(image) for image in message.images),
+    )
 
 
 def _report(image: ImageOverlap) -> OverlapReport:

@@ -44,6 +44,7 @@ class Stage:
         rclpy.init(args=["--ros-args", "--log-level", "error", *arguments])
         self.node = FramesNode()
         self.others = Node("others")
+        self._added: list[Node] = []
         self.keyframes: list[CompressedImage] = []
         self.decisions: list[FrameDecision] = []
         self.retired: list[KeyframesRetired] = []
@@ -66,9 +67,20 @@ class Stage:
             )
         )
 
+    def add_node(self, name: str, stage: bool) -> Node:
+        """A node that subscribes to keyframes: one of the graph's stages, which offer Finish, or a viewer."""
+        node = Node(name)
+        node.create_subscription(CompressedImage, "keyframes/image/compressed", lambda _: None, qos.reliable(50))
+        node.create_subscription(CameraInfo, "keyframes/camera_info", lambda _: None, qos.reliable(50))
+        if stage:
+            node.create_service(Finish, "~/finish", lambda request, response: response)
+        self._executor.add_node(node)
+        self._added.append(node)
+        return node
+
     def close(self) -> None:
         self._executor.shutdown()
-        for node in (self.node, self.others):
+        for node in (self.node, self.others, *self._added):
             node.destroy_node()
         rclpy.try_shutdown()
 
@@ -215,8 +227,8 @@ def test_what_the_sfm_answers_adds_and_retires_keyframes(stage: Callable[..., St
 def test_a_recording_becomes_a_network(stage: Callable[..., Stage], wall: NDArray) -> None:
     """0.5 frames a second, of which the SfM's answers leave every second one, until no group is above the band."""
     scene = stage("-p", "policy:=network", "-p", "lockstep:=true")
-    scene.others.create_subscription(CameraInfo, "keyframes/camera_info", lambda _: None, qos.reliable(50))
-    scene.others.create_subscription(CameraInfo, "keyframes/camera_info", lambda _: None, qos.reliable(50))
+    scene.add_node("reconstruction", stage=True)
+    scene.add_node("pipes", stage=True)
     images: set[int] = set()
     done = [0, 0]
 
@@ -260,6 +272,25 @@ def test_a_recording_becomes_a_network(stage: Callable[..., Stage], wall: NDArra
         return {stamp for stamp, chosen in latest.items() if chosen}
 
     scene.spin_until(lambda: last_word() == images)
+
+
+def test_a_viewer_is_not_taken_for_the_detector(stage: Callable[..., Stage], wall: NDArray) -> None:
+    """In lockstep nothing is published before SfM and detector are there, however many viewers subscribe."""
+    scene = stage("-p", "lockstep:=true")
+    scene.add_node("sfm", stage=True)
+    scene.add_node("rviz", stage=False)
+    scene.add_node("image_view", stage=False)
+    topics = ("keyframes/image/compressed", "keyframes/camera_info")
+    scene.spin_until(lambda: all(scene.node.count_subscribers(topic) >= 3 for topic in topics))
+    scene.show(START, compressed(START, view(wall, 0)))
+    scene.spin_until(lambda: scene.decisions)
+    connecting = scene.node._connecting
+    scene.spin_until(lambda: connecting.time_until_next_call() < 5e7)
+    scene.spin_until(lambda: connecting.time_until_next_call() > 5e7)  # it has looked once more
+    assert not scene.keyframes
+    assert not connecting.is_canceled()
+    scene.add_node("detect", stage=True)
+    scene.spin_until(lambda: scene.keyframes)
 
 
 def test_a_network_takes_a_recording(stage: Callable[..., Stage]) -> None:

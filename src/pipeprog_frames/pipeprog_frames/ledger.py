@@ -1,0 +1,69 @@
+"""Which keyframes and retirements were published, and which of them the SfM has answered to."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pipeprog_frames.feedback import OverlapReport
+
+MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One answer of the SfM; fields as in pipeprog_msgs/ImageOverlapArray.
+
+    Attributes:
+        stamp: of the newest keyframe that it has considered [ns].
+        keyframes: number of keyframes that it has considered.
+        retirements: number of retirements that it has considered.
+        reports: overlaps that changed.
+    """
+
+    stamp: int
+    keyframes: int
+    retirements: int
+    reports: tuple[OverlapReport, ...]
+
+
+class Ledger:
+    """Counts of what was published and answered, and the answers that were not used yet."""
+
+    def __init__(self) -> None:
+        self.published: list[int] = []  # stamps in the order of publication
+        self.lag = 0  # keyframes that the SfM is behind
+        self._retirements = self._answered = self._answered_retirements = 0
+        self._answers: deque[Answer] = deque()
+
+    def publish(self, stamp: int) -> None:
+        """Notes a published keyframe."""
+        self.published.append(stamp)
+
+    def retire(self) -> None:
+        """Notes a published retirement."""
+        self._retirements += 1
+
+    def receive(self, answer: Answer) -> None:
+        """Notes an answer; its reports wait until they are asked for."""
+        self._answered = max(self._answered, answer.keyframes)
+        self._answered_retirements = max(self._answered_retirements, answer.retirements)
+        self._answers.append(answer)
+        if answer.stamp in self.published:  # by stamp, since a count would never recover from a lost keyframe
+            self.lag = len(self.published) - 1 - self.published.index(answer.stamp)
+
+    def reports(self, keyframes: int) -> Iterator[tuple[OverlapReport, ...]]:
+        """Takes out the reports of answers to no more than the first `keyframes` keyframes."""
+        while self._answers and self._answers[0].keyframes <= keyframes:
+            yield self._answers.popleft().reports
+
+    @property
+    def is_answered(self) -> bool:
+        """Whether the SfM has answered to everything."""
+        return self._answered >= len(self.published) and self._answered_retirements >= self._retirements
+
+    @property
+    def may_publish(self) -> bool:
+        """Whether the SfM has followed closely enough for the next keyframe, in lockstep."""
+        return self._answered_retirements >= self._retirements and len(self.published) - self._answered < MAX_AHEAD

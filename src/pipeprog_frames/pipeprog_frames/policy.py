@@ -1,0 +1,39 @@
+"""What chooses keyframes: a policy is shown every frame and the SfM's overlap reports, and returns decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+from pipeprog_camera.camera import Camera
+from pipeprog_frames.config import FramesConfig
+from pipeprog_frames.feedback import BestBetween, OverlapReport
+from pipeprog_frames.image_network import ImageNetwork
+from pipeprog_frames.selector import Decision, Load
+from pipeprog_frames.stream import KeyframeStream
+
+
+class Policy(Protocol):
+    """KeyframeStream or ImageNetwork."""
+
+    def consider(self, stamp: int, load: Load | None) -> list[Decision]:
+        """Takes the next frame: its stamp [ns], and what decodes it (None: it cannot be decoded)."""
+
+    def flush(self) -> list[Decision]:
+        """Decides on the frames that are still undecided, after the last one."""
+
+    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
+        """Takes overlap reports of the SfM; returns keyframes to add (chosen) and to retire (not chosen)."""
+
+    def finish_round(self) -> list[Decision]:
+        """What to add and retire once all frames have come and the SfM has answered to all keyframes; empty: done."""
+
+    def report_outside_band(self) -> list[Decision]:
+        """The keyframes whose overlap is outside the band in the end, each with the reason."""
+
+
+def make_policy(config: FramesConfig, camera: Camera, best_between: BestBetween) -> Policy:
+    """The policy that `config.policy` names; `best_between` finds a frame between two stamps."""
+    if config.policy == "network":
+        return ImageNetwork(config.overlap_min, config.overlap_min + config.overlap_band, best_between)
+    return KeyframeStream(config, camera, best_between)
