@@ -6,7 +6,7 @@ from bisect import bisect_left, insort
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
-from pipeprog_frames.selector import Decision
+from pipeprog_frames.decision import Decision
 
 MIN_GAIN = 0.01  # of overlap that an added frame must bring, or the next one would not help either
 MAX_BRIDGES = 3  # frames on each side of an image that does not register: the last comes within an eighth of the gap

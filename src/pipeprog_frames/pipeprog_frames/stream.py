@@ -1,4 +1,4 @@
-"""Keyframes out of a stream: a cheap prediction chooses at once, what the SfM answers corrects it."""
+"""Keyframes of a stream: a fast prediction chooses at once, and the SfM's overlap reports correct the choice."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from collections.abc import Iterable
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
+from pipeprog_frames.decision import Decision, Load
 from pipeprog_frames.feedback import BestBetween, OverlapReport, StreamFeedback
-from pipeprog_frames.selector import Decision, FrameSelector, Load
+from pipeprog_frames.selector import FrameSelector
 
-UNLOADED_LAG = 5  # keyframes that the SfM may be behind without being overloaded: it adjusts for seconds at times
-FULL_LAG = 25  # half of what its queue holds
+UNLOADED_LAG = 5  # keyframes that the SfM may be behind without load: a bundle adjustment takes seconds at times
+FULL_LAG = 25  # keyframes behind at which the load counts as full: half of what the SfM's queue holds (50)
 
 
 class KeyframeStream:
@@ -25,34 +26,34 @@ class KeyframeStream:
 
     @property
     def overlap_min(self) -> float:
-        """The least predicted overlap as relieved."""
-        return self._selector.overlap_min
+        """The minimum predicted overlap, which is lower under load."""
+        return self._selector.limits.overlap_min
 
     def consider(self, stamp: int, load: Load | None) -> list[Decision]:
         """Takes the next frame; see FrameSelector.consider."""
-        return self._noted(self._selector.consider(stamp, load))
+        return self._recorded(self._selector.consider(stamp, load))
 
     def flush(self) -> list[Decision]:
-        """Decides on the frames that are still open."""
-        return self._noted(self._selector.flush())
+        """Decides on the frames that are still undecided."""
+        return self._recorded(self._selector.flush())
 
     def lag(self, keyframes: int) -> None:
-        """Tells how many keyframes the SfM is behind: the further, the fewer are chosen."""
-        self._selector.relax(min(max((keyframes - UNLOADED_LAG) / (FULL_LAG - UNLOADED_LAG), 0.0), 1.0))
+        """Notes how many keyframes the SfM is behind: the more, the fewer are chosen."""
+        self._selector.limits.relax(min(max((keyframes - UNLOADED_LAG) / (FULL_LAG - UNLOADED_LAG), 0.0), 1.0))
 
     def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
-        """Takes the SfM's answers; returns frames to add (chosen) and to give back (not chosen)."""
+        """Takes overlap reports of the SfM; returns frames to add (chosen) and to retire (not chosen)."""
         return self._feedback.answer(reports)
 
     def finish_round(self) -> list[Decision]:
-        """What is to change when no frames come any more and the SfM has answered to all keyframes."""
+        """What to add and retire once all frames have come and the SfM has answered to all keyframes."""
         return self._feedback.answer((), complete=True)
 
     def report_outside_band(self) -> list[Decision]:
-        """Nothing: a stream promises no band."""
+        """Nothing: a stream has no overlap band to keep."""
         return []
 
-    def _noted(self, decisions: list[Decision]) -> list[Decision]:
+    def _recorded(self, decisions: list[Decision]) -> list[Decision]:
         for decision in decisions:
             if decision.chosen:
                 self._feedback.chosen(decision)

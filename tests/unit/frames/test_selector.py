@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
+from pipeprog_frames.decision import Decision, Load
 from pipeprog_frames.decoding import decode_reduced, is_cut_off, reduction
 from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing
-from pipeprog_frames.selector import Decision, FrameSelector, Load
+from pipeprog_frames.selector import FrameSelector
 from pipeprog_frames.stream import KeyframeStream
 from pipeprog_frames.tracker import Tracker
 
@@ -139,7 +140,7 @@ def test_relief_asks_for_fewer_keyframes(wall: NDArray[np.uint8]) -> None:
     counts = []
     for relief in (0.0, 0.5, 1.0):
         selector = FrameSelector(FramesConfig(), CAMERA)
-        selector.relax(relief)
+        selector.limits.relax(relief)
         counts.append(sum(decision.chosen for decision in run(selector, images)))
     assert counts[0] > counts[1] > counts[2] > 3
 
