@@ -1,4 +1,4 @@
-"""Decodes images no larger than the tracker needs them."""
+"""Decodes images at the reduced size that the tracker needs."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 GrayImage = NDArray[np.uint8]
 
-WORKING_WIDTH = (
-    320  # wide enough for a hundred corners; a JPEG at 1/4 or 1/8 size needs no inverse transform to speak of
-)
+# px; enough for a hundred corners. A JPEG at 1/4 or 1/8 of its size costs little beyond its entropy decoding.
+WORKING_WIDTH = 320
 REDUCED = {
     1: cv2.IMREAD_GRAYSCALE,
     2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
@@ -20,7 +19,7 @@ REDUCED = {
 
 
 def reduction(width: int) -> int:
-    """By how much (1, 2, 4 or 8) an image of this width is reduced to come nearest above WORKING_WIDTH."""
+    """Factor (1, 2, 4 or 8) by which an image of this width is reduced: the largest that leaves WORKING_WIDTH."""
     return max((factor for factor in REDUCED if width // factor >= WORKING_WIDTH), default=1)
 
 
@@ -31,14 +30,14 @@ def reduced_size(width: int, height: int) -> tuple[int, int]:
 
 
 def is_cut_off(encoded: bytes) -> bool:
-    """Whether these bytes are no whole image: the decoder paints the missing part of a JPEG grey and says nothing."""
+    """Whether the encoded image is empty or a JPEG without its end, which the decoder would fill with grey silently."""
     return not encoded or (encoded.startswith(b"\xff\xd8") and b"\xff\xd9" not in encoded[-64:])
 
 
 def decode_reduced(encoded: bytes, width: int) -> GrayImage | None:
     """(h, w) grey image of the JPEG or PNG bytes of an image `width` px wide; None where they are damaged.
 
-    As stored: the calibration knows nothing of an EXIF rotation.
+    An EXIF rotation is ignored, since the calibration is for the image as stored.
     """
     flags = REDUCED[reduction(width)] | cv2.IMREAD_IGNORE_ORIENTATION
     return None if is_cut_off(encoded) else cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)

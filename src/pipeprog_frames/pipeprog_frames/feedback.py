@@ -1,4 +1,4 @@
-"""What the SfM's answers ask of a stream of keyframes: frames added where it is loose, others given back."""
+"""Corrections of a stream of keyframes by the SfM's overlap reports: frames added in weak places, others retired."""
 
 from __future__ import annotations
 
@@ -8,17 +8,27 @@ from dataclasses import dataclass
 
 from pipeprog_frames.decision import Decision
 
-MIN_GAIN = 0.01  # of overlap that an added frame must bring, or the next one would not help either
-MAX_BRIDGES = 3  # frames on each side of an image that does not register: the last comes within an eighth of the gap
-LOOKAHEAD = 2  # later keyframes that a judgement waits for
-MIN_RUN = 4  # "groups of more than three"
+MIN_GAIN = 0.01  # of overlap, by an added frame; with less, the next frame would not help either
+MAX_BRIDGES = 3  # frames added on each side of an unregistered image: the third is at an eighth of the gap
+LOOKAHEAD = 2  # later keyframes whose reports a judgement waits for
+MIN_RUN = 4  # consecutive images above the band that are thinned out: the paper's "groups of more than three"
 
-BestBetween = Callable[[int, int, Collection[int]], "int | None"]  # the best frame between two stamps, without some
+# Stamp of the best frame between two stamps, some stamps excluded; None where there is none.
+BestBetween = Callable[[int, int, Collection[int]], "int | None"]
 
 
 @dataclass(frozen=True)
 class OverlapReport:
-    """The SfM's answer for one keyframe: fields as in pipeprog_msgs/ImageOverlap."""
+    """Overlap of one keyframe as the SfM has measured it; fields as in pipeprog_msgs/ImageOverlap.
+
+    Attributes:
+        stamp: of the keyframe [ns].
+        registered: whether its pose is known; the other fields are valid only then.
+        overlap: Eq. 1 of the paper, 0 to 1.
+        cell_overlap: the same counted in cells of the image, which a single wrong feature cannot change.
+        matches_previous: matches with the keyframe before it.
+        matches_next: matches with the keyframe after it.
+    """
 
     stamp: int
     registered: bool
@@ -33,22 +43,21 @@ class _Keyframe:
     stamp: int
     overlap: float  # predicted, with the keyframe before it
     parallax: float
-    fixed: bool = False  # asked for by feedback: never given back
+    fixed: bool = False  # added by feedback: never retired
     report: OverlapReport | None = None
     bridges: int = 0
     overlap_when_helped: float = -1.0
 
 
 class StreamFeedback:
-    """Keyframes so far, and what to change about them.
+    """Keyframes so far, and the corrections that the overlap reports call for.
 
-    A keyframe is judged once the SfM has answered to the next two as well: the first of them connects the other half of
-    what it shows, the second one makes points of it.
-    It counts as loose when the lower of hull and cell overlap (Eq. 1 of the paper, and its version that a single stray
-    feature cannot move) is below `overlap_min`. Of runs of more than three above `overlap_max` every second one is
-    given back where its neighbours still overlap by `overlap_min` and see each other within `parallax_max` px.
+    A keyframe is judged once the SfM has answered to the next two as well: the first of them matches the other half
+    of its image, the second one triangulates it. It gets a frame beside it where the smaller of its two overlaps is
+    below `overlap_min`. In groups of more than three above `overlap_max`, every second one is retired where its
+    neighbours still overlap by `overlap_min` with a parallax below `parallax_max` px.
 
-    It ends: a frame that was added is never given back, one that was given back is never added again.
+    This terminates: a frame that was added is never retired, and a retired one is never added again.
     """
 
     def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, middle: BestBetween) -> None:
@@ -63,9 +72,9 @@ class StreamFeedback:
         self._insert(_Keyframe(decision.stamp, decision.overlap, decision.parallax))
 
     def answer(self, reports: Iterable[OverlapReport], complete: bool = False) -> list[Decision]:
-        """Takes the SfM's answers; returns the frames to add (chosen) and to give back (not chosen).
+        """Takes overlap reports; returns the frames to add (chosen) and to retire (not chosen).
 
-        `complete`: no more keyframes come, so the last one is judged as well.
+        `complete`: no more keyframes come, so the last ones are judged as well.
         """
         for report in reports:
             if report.stamp in self._keyframes:
@@ -73,7 +82,7 @@ class StreamFeedback:
         decisions: list[Decision] = []
         for stamp in list(self._stamps):
             if self._is_judged(stamp, complete):
-                decisions += self._tighten(stamp)
+                decisions += self._add_beside(stamp)
         return decisions + self._thin(complete)
 
     def _insert(self, keyframe: _Keyframe) -> None:
@@ -95,7 +104,7 @@ class StreamFeedback:
         around = self._stamps[max(index - 1, 0) : index + LOOKAHEAD + 1]
         return all(self._keyframes[other].report is not None for other in around)
 
-    def _tighten(self, stamp: int) -> list[Decision]:
+    def _add_beside(self, stamp: int) -> list[Decision]:
         keyframe = self._keyframes[stamp]
         report = keyframe.report
         assert report is not None
@@ -133,21 +142,21 @@ class StreamFeedback:
         decisions = []
         run: list[int] = []
         for stamp in [*self._stamps, None]:
-            if stamp is not None and self._is_judged(stamp, complete) and self._is_ample(stamp):
+            if stamp is not None and self._is_judged(stamp, complete) and self._is_above_band(stamp):
                 run.append(stamp)
                 continue
             if len(run) >= MIN_RUN:
-                decisions += [d for second in run[1::2] for d in self._give_back(second)]
+                decisions += [d for second in run[1::2] for d in self._retire(second)]
             run = []
         return decisions
 
-    def _is_ample(self, stamp: int) -> bool:
+    def _is_above_band(self, stamp: int) -> bool:
         report = self._keyframes[stamp].report
         assert report is not None
         return report.registered and min(report.overlap, report.cell_overlap) > self._overlap_max
 
-    def _give_back(self, stamp: int) -> list[Decision]:
-        """Retires a keyframe, where the gap that it leaves is not one that the selector would have filled."""
+    def _retire(self, stamp: int) -> list[Decision]:
+        """Retires a keyframe unless the selector would fill the gap again."""
         keyframe = self._keyframes[stamp]
         _, after = self._neighbours(stamp)
         if keyframe.fixed or after is None:

@@ -15,12 +15,12 @@ from pipeprog_frames.corners import corners, sharpness
 from pipeprog_frames.decoding import GrayImage, decode_reduced
 from pipeprog_frames.tracker import MIN_CORNERS
 
-CHOICE = 3  # frames nearest to the middle, of which the sharpest is taken: a step blurs one, not its neighbours
+CHOICE = 3  # frames nearest to the middle, of which the sharpest is taken: a footstep blurs one, not all three
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """One image as it came: stamp [ns], frame of the camera, JPEG or PNG bytes, calibration."""
+    """One image as received: stamp [ns], frame of the camera, JPEG or PNG bytes, calibration."""
 
     stamp: int
     frame_id: str
@@ -37,11 +37,11 @@ class FrameStore(ABC):
 
     @abstractmethod
     def _write(self, encoded: bytes) -> int:
-        """Stores bytes and returns their start, having taken out those that were there."""
+        """Stores bytes and returns their start; forgets the frames whose bytes it overwrites."""
 
     @abstractmethod
     def _read(self, start: int, size: int) -> bytes:
-        """The bytes that were stored there."""
+        """The `size` bytes stored from `start` on."""
 
     def add(self, frame: EncodedFrame) -> None:
         """Stores a frame whose stamp is later than all others; others are refused. Raises InputError on a full disk."""
@@ -56,14 +56,20 @@ class FrameStore(ABC):
         frame = self._frames.get(stamp)
         return replace(frame, encoded=self._read(*self._places[stamp])) if frame is not None else None
 
-    def look(self, stamp: int) -> GrayImage | None:
-        """The frame, reduced and grey; None when it is gone, damaged or shows too little to be a keyframe."""
+    def reduced(self, stamp: int) -> GrayImage | None:
+        """The frame, reduced and grey; None where it is gone, damaged or has too few corners for a keyframe."""
         frame = self.get(stamp)
         gray = decode_reduced(frame.encoded, frame.camera.width) if frame else None
         return gray if gray is not None and len(corners(gray)) >= MIN_CORNERS else None
 
     def sharpest_between(self, after: int, before: int, without: Collection[int] = ()) -> int | None:
-        """The stamp of the sharpest usable frame about the middle of the open interval, None when there is none."""
+        """Stamp of the sharpest usable frame near the middle of an open interval; None where there is none.
+
+        Args:
+            after: start of the interval [ns].
+            before: end of the interval [ns].
+            without: stamps that are not to be taken.
+        """
         stamps = list(self._frames)
         inside = [
             stamp
@@ -72,7 +78,7 @@ class FrameStore(ABC):
         ]
         sharp: dict[int, float] = {}
         for stamp in sorted(inside, key=lambda stamp: (abs(2 * stamp - after - before), stamp)):
-            gray = self.look(stamp)
+            gray = self.reduced(stamp)
             if gray is not None:
                 sharp[stamp] = sharpness(gray)
             if len(sharp) == CHOICE:
@@ -81,37 +87,37 @@ class FrameStore(ABC):
 
 
 class FrameRing(FrameStore):
-    """The last frames, in `capacity` bytes of memory; the oldest are written over.
+    """The latest frames, in `capacity` bytes of memory; the oldest are overwritten.
 
-    One piece of memory: pieces of all sizes that come and go would leave ever more gaps between them.
+    It is one block of memory, since allocating and freeing blocks of all sizes would fragment the heap.
     """
 
     def __init__(self, capacity: int) -> None:
         super().__init__()
-        self._memory = mmap.mmap(-1, capacity)  # taken from the system as it is filled
+        self._memory = mmap.mmap(-1, capacity)  # the system provides its pages as they are first written
         self._end = 0
 
     def _write(self, encoded: bytes) -> int:
         size = len(encoded)
         if size > len(self._memory):  # a frame larger than all of it is held alone
-            self._give_up(lambda start, end: True)
+            self._forget(lambda start, end: True)
             self._memory.close()
             self._memory, self._end = mmap.mmap(-1, size), 0
         if self._end + size > len(self._memory):
             behind = self._end
-            self._give_up(lambda start, end: start >= behind)
+            self._forget(lambda start, end: start >= behind)
             self._end = 0
         begin, self._end = self._end, self._end + size
-        self._give_up(lambda start, end: start < begin + size and end > begin)
+        self._forget(lambda start, end: start < begin + size and end > begin)
         self._memory[begin : begin + size] = encoded
         return begin
 
-    def _give_up(self, is_in_the_way: Callable[[int, int], bool]) -> None:
-        """Forgets the oldest frames as long as they are in the way."""
+    def _forget(self, overlaps: Callable[[int, int], bool]) -> None:
+        """Forgets the oldest frames for as long as `overlaps(start, end)` of their bytes."""
         while self._frames:
             oldest = next(iter(self._frames))
             start, size = self._places[oldest]
-            if not is_in_the_way(start, start + size):
+            if not overlaps(start, start + size):
                 return
             del self._frames[oldest], self._places[oldest]
 
@@ -120,7 +126,7 @@ class FrameRing(FrameStore):
 
 
 class FrameFile(FrameStore):
-    """Every frame of a recording; their bytes lie in a file that is gone with the process."""
+    """Every frame of a recording; their bytes are in a temporary file that ends with the process."""
 
     def __init__(self) -> None:
         super().__init__()

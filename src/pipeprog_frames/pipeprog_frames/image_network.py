@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper over a whole recording: the images of a network with an even overlap."""
+"""Algorithm 1 of the paper: chooses the images of a recording so that their overlap is within a band."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ TOLERANCE = 1e-6  # of an overlap, which travels as a float of 32 bits
 class ImageNetwork:
     """Starts at 0.5 frames a second; each round adds and removes images by the overlap that the SfM has measured.
 
-    A round: as long as an image does not register, it gets one frame before and one after. Then each image whose
-    overlap (Eq. 1) is below `overlap_min` gets one frame between it and that neighbour with which it has the fewer
-    matches, and of each group of more than three consecutive images above `overlap_max` every second one goes; the
-    first and the last image stay, for nothing else shows what they show.
+    A round: while images are unregistered, each of them gets one frame before and one after it. Otherwise each image
+    whose overlap (Eq. 1) is below `overlap_min` gets one frame between it and the neighbour with which it has fewer
+    matches, and of each group of more than three consecutive images above `overlap_max` every second one is removed;
+    the first and the last image stay, since no other shows their outer halves.
 
-    It ends: an image that was removed and is called for again stays for good, so each frame changes three times at
-    most, and a round without a change is the last.
+    This terminates: an image that was removed and added again is never removed again, so each frame changes three
+    times at most, and a round without a change is the last.
     """
 
     def __init__(self, overlap_min: float, overlap_max: float, middle: BestBetween) -> None:
@@ -59,19 +59,19 @@ class ImageNetwork:
         return []
 
     def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
-        """Takes what the SfM says about images that it has worked off; nothing changes before it has seen all."""
+        """Takes overlap reports; nothing changes before the SfM has answered to all images."""
         self._reports.update((report.stamp, report) for report in reports)
         return []
 
     def finish_round(self) -> list[Decision]:
-        """One round, once the SfM has answered to all images: what to add (chosen), what to remove; none: the end."""
+        """One round, once the SfM has answered to all images: what to add (chosen) and to remove; empty: done."""
         decisions = self._connect() or self._fill() + self._thin()
         self.rounds += bool(decisions)
         return decisions
 
     def report_outside_band(self) -> list[Decision]:
-        """The images that are not inside the band, each with the reason."""
-        return [Decision(stamp, True, reason) for stamp in self._images if (reason := self._excuse(stamp))]
+        """The images whose overlap is outside the band, each with the reason."""
+        return [Decision(stamp, True, reason) for stamp in self._images if (reason := self._reason_outside(stamp))]
 
     def _overlap(self, stamp: int) -> float | None:
         """Eq. 1; None where the image is not registered."""
@@ -142,7 +142,7 @@ class ImageNetwork:
     def _is_removable(self, stamp: int) -> bool:
         return stamp not in self._fixed and stamp not in (self._images[0], self._images[-1])
 
-    def _excuse(self, stamp: int) -> str:
+    def _reason_outside(self, stamp: int) -> str:
         overlap = self._overlap(stamp)
         if overlap is None:
             return "does not register, and no frame is left before or after it"

@@ -1,4 +1,4 @@
-"""Predicts overlap and parallax with the last keyframe on a reduced image, in milliseconds."""
+"""Predicts overlap and parallax with the last keyframe by tracking corners in reduced images."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from pipeprog_camera.camera import Camera
 from pipeprog_frames.corners import PointArray, corners
 from pipeprog_frames.decoding import GrayImage
 
-MIN_CORNERS = 30  # below this a hull and a median say nothing
-MIN_TRACKED = 10  # an affine map takes three: the rest are witnesses
-AGREEING_MIN = 0.4  # corners that slid agree by chance on some map: a minority is no evidence
-RELIEF_MAX = 0.03  # share of the width by which near and far points may part from one affine map between keyframes
-# At the coarsest level nearly half of the image's height: a larger one would look past its edge. Eight pixels are one
-# SIMD register: nine take 1.2 times as long, seven twice.
+MIN_CORNERS = 30  # in a keyframe: enough for a median after losing two thirds
+MIN_TRACKED = 10  # corners: three determine an affine map, the others confirm it
+AGREEING_MIN = 0.4  # of the tracked corners, on one affine map: fewer agree by chance where tracking slid
+RELIEF_MAX = 0.03  # of the image width, distance from the affine map: parallax of near and far points moves them
+# px. At the coarsest level it covers nearly half of the image's height; a larger one would reach beyond the edge.
+# Eight pixels fill a SIMD register: nine take 1.2 times as long, seven twice.
 LK_WINDOW = (8, 8)
 LK_LEVELS = 4  # reaches 8/2 * 2^4 = 64 px, a fifth of the width: a turn of 14 degrees between frames
-LK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.1)  # px; a hundredth of overlap is three
-KABSCH_ROUNDS = 3  # more move the median by less than a pixel of the full image, a fiftieth of what makes a keyframe
+LK_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.1)  # px; 0.01 of overlap is 3 px
+KABSCH_ROUNDS = 3  # of reweighting; more change the median by less than 1 px of the full image, limit: 51 px at 1280
 
 
 def _shared_area(affine: FloatArray, width: int, height: int) -> float:
@@ -43,7 +43,7 @@ def _fit_affine(points: PointArray, moved: PointArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Track:
-    """How a frame relates to the keyframe: overlap in [0, 1]; parallax in px of the full image; corners still held."""
+    """Relation of a frame to the keyframe: overlap, 0 to 1; parallax, px of the full image; number of corners."""
 
     overlap: float
     parallax: float
@@ -52,12 +52,12 @@ class Track:
 
 @dataclass(frozen=True)
 class _State:
-    """The last image, and the (N, 2) corners still held: their (N, 3) rays and places in the keyframe, places in it."""
+    """The last image and the corners tracked into it."""
 
     image: GrayImage
-    rays: FloatArray
-    reference: PointArray
-    current: PointArray
+    rays: FloatArray  # (N, 3) in the keyframe
+    reference: PointArray  # (N, 2) in the keyframe
+    current: PointArray  # (N, 2) in the image
 
     def kept(self, held: NDArray[np.bool_]) -> _State:
         return _State(self.image, self.rays[held], self.reference[held], self.current[held])
@@ -102,7 +102,7 @@ class Tracker:
         return Track(_shared_area(affine, width, height), self._parallax(), len(state.current))
 
     def undo(self) -> None:
-        """Forgets the last frame tracked: a covered lens or a dark second must not lose the corners."""
+        """Returns to the state before the last frame tracked, such as one that a hand covered."""
         self._state = self._undo
 
     def _lost(self, gray: GrayImage) -> Track:
@@ -133,10 +133,10 @@ def _directions(pixels: FloatArray, fx: float, fy: float, cx: float, cy: float) 
 
 @njit(cache=True)
 def _unexplained(reference: FloatArray, current: FloatArray) -> float:
-    """Median distance [-] of (N, 3) unit rays from those of the keyframe, turned as suits most (Kabsch, reweighted)."""
+    """Median distance [-] of (N, 3) unit rays from those of the keyframe, rotated to fit best (Kabsch, reweighted)."""
     residual = np.zeros(len(reference))
     weights = np.ones(len(reference))
-    for _ in range(KABSCH_ROUNDS):  # reweighted: near points, which move most, must not turn the far ones
+    for _ in range(KABSCH_ROUNDS):  # reweighted, since the parallax of near points must not bias the rotation
         covariance = np.zeros((3, 3))
         for n in range(len(reference)):
             for i in range(3):

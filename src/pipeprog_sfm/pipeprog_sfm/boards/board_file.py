@@ -1,4 +1,4 @@
-"""The file of target boards: what hangs on the site, and what was measured between it."""
+"""The board file: the boards and scale bars on a site, and distances measured between boards."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class ScaleBar:
-    """Two discs of one size.
+    """Two discs of one size, put up a measured distance apart; `marks` in the file.
 
     Attributes:
         name: for people.
@@ -50,7 +50,7 @@ class ScaleBar:
 
     @property
     def distance(self) -> KnownDistance:
-        """Between the circles of `discs`."""
+        """The distance between the circles of `discs`."""
         one, two = self.discs
         return KnownDistance(self.name, ((one.name, 0), (two.name, 0)), self.length, self.sigma)
 
@@ -63,12 +63,12 @@ class ScaleBar:
 
 @dataclass(frozen=True)
 class BoardFile:
-    """Everything with a known size.
+    """Content of a board file: everything of known size; empty without a file.
 
     Attributes:
         boards: flat boards with circles.
         distances: measured between circles of boards.
-        scale_bars: pairs of single discs.
+        scale_bars: pairs of discs.
     """
 
     boards: Sequence[Board] = ()
@@ -77,7 +77,7 @@ class BoardFile:
 
 
 def load_board_file(path: str | Path) -> BoardFile:
-    """What a BOARD.yaml file says; at least one board or pair of marks.
+    """Reads a BOARD.yaml file with at least one board or scale bar.
 
     boards: [{name, circle_radius_mm, centres_mm: [[x, y], ...]}]
     distances: [{from: A/1, to: B/3, distance_mm, sigma_mm}], where `A/1` is the first circle of board A
@@ -87,7 +87,7 @@ def load_board_file(path: str | Path) -> BoardFile:
         InputError: the file cannot be read, a key is missing or unknown, text stands where a number belongs, a length
             is not positive, a board has fewer than three circles, circles that overlap or lie on one line, a layout
             that looks the same turned by 120 degrees or less, or a name that is taken, a distance ends at a circle
-            that is not in the file, or the marks of a pair overlap.
+            that is not in the file, or the discs of a scale bar overlap.
     """
     content = _content(path)
     entries = {key: content.get(key, []) for key in ("boards", "distances", "marks")}
@@ -103,8 +103,8 @@ def load_board_file(path: str | Path) -> BoardFile:
             raise InputError(f"{path}: the name '{board.name}' is given to two boards: names must be unique")
         boards.append(board)
     distances = [_distance(entry, f"{path}: distance {k}", boards) for k, entry in enumerate(entries["distances"], 1)]
-    marks = [_marks(entry, f"{path}: marks {k}", f"marks {k}") for k, entry in enumerate(entries["marks"], 1)]
-    return BoardFile(tuple(boards), tuple(distances), tuple(marks))
+    bars = [_scale_bar(entry, f"{path}: marks {k}", f"marks {k}") for k, entry in enumerate(entries["marks"], 1)]
+    return BoardFile(tuple(boards), tuple(distances), tuple(bars))
 
 
 def _distance(value: Any, where: str, boards: Sequence[Board]) -> KnownDistance:
@@ -127,12 +127,12 @@ def _distance(value: Any, where: str, boards: Sequence[Board]) -> KnownDistance:
     return KnownDistance(f"{entry['from']} to {entry['to']}", (ends[0], ends[1]), length, sigma)
 
 
-def _marks(value: Any, where: str, name: str) -> ScaleBar:
+def _scale_bar(value: Any, where: str, name: str) -> ScaleBar:
     entry = _entry(value, ("circle_radius_mm", "distance_mm", "sigma_mm"), where)
     radius = _circle_radius(entry, where)
     length, sigma = _length(entry, where)
     if length <= 2 * radius:
-        raise InputError(f"{where}: distance_mm = {1000 * length:g} is within the marks: measure between centres")
+        raise InputError(f"{where}: distance_mm = {1000 * length:g} is within the discs: measure between centres")
     return ScaleBar(name, radius, length, sigma)
 
 

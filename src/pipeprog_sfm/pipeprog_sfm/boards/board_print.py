@@ -1,4 +1,4 @@
-"""Target boards as PDF pages to print at true size."""
+"""Boards as PDF pages to print at true size."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ PAPERS = {
     "tabloid": (279.4, 431.8),
 }
 
-QUIET = 0.75  # dark rim around the circles, in radii: wide enough for the threshold that finds them
+QUIET = 0.75  # dark rim around the circles, in radii: wide enough for the local threshold that finds them
 EDGE = 6.0  # mm that printers leave white
 RULER = 100.0  # mm
 STRIP = 16.0  # mm below the board, for the ruler and the line of text
 POINTS_PER_MM = 72 / 25.4
-KAPPA = 0.5522847498  # control points of a quarter circle: 0.03 % of the radius off, a hundredth of a millimetre here
+KAPPA = 0.5522847498  # control points of a quarter circle: 0.03 % of the radius off, 0.01 mm at 40 mm
 
 
 def board_pdf(boards: Sequence[Board], paper: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Bright discs on dark ground in an image, as ellipses with sub-pixel edges."""
+"""Bright discs on dark ground, found in an image as ellipses with sub-pixel edges."""
 
 from __future__ import annotations
 
@@ -13,10 +13,18 @@ from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.conic import axes_and_angle, conic_from_ellipse
 from pipeprog_sfm.config import BoardConfig
 
-PROFILES = 64  # edge points of one ellipse: every centre is then known to about a sixth of the noise of an edge point
-MAX_FLATTENING = 5.0  # ratio of the axes: a disc seen under more than 78 degrees has no usable edge on its far side
-MIN_CONTRAST = 25.0  # grey levels between disc and ground: far above the noise and the ringing of JPEG
+PROFILES = 64  # edge points of an ellipse: a coordinate of its centre has sqrt(2/64), a sixth, of their noise
+MIN_PROFILES = 0.75  # of these, that must show an edge: a disc may be partly hidden, or lie at the board's rim
+MAX_FLATTENING = 5.0  # ratio of the axes: 78 degrees of tilt; beyond, the two edges' blurs overlap
+MIN_CONTRAST = 25.0  # grey levels between disc and ground: ten times the noise of a camera, three times JPEG's ringing
 STEP = 0.5  # px between the samples of an edge profile
+MIN_REACH, MAX_REACH = 1.5, 4.0  # px of a profile to both sides of the edge: the blur of a sharp and of a soft image
+REACH = 0.6  # of the semi-minor axis, likewise: a profile must not reach the disc's opposite edge
+EDGE_HALF_WIDTH = 1.8  # px around the steepest place that count as the edge: two sigma of a blur of 0.9 px
+MIN_EDGE_SHARE = 0.6  # of all falls of grey along a profile, within the edge: texture has several
+MAX_AREA_ERROR = 0.1  # relative, of a contour's area against its ellipse's ...
+AREA_ERROR_PX = 0.5  # ... and px of its semi-minor axis: the staircase of pixels
+REJECTION = 3.0  # robust standard deviations of an edge point from its ellipse, plus 0.02 px of interpolation
 
 
 @dataclass(frozen=True)
@@ -25,7 +33,7 @@ class ImageEllipses:
 
     Attributes:
         centres: (E, 2) centres of the ellipses, px.
-        shapes: (E, 2, 2) shape matrices, px^2; see `pipeprog_sfm.conic`.
+        shapes: (E, 2, 2) shape matrices, px^2; see `pipeprog_sfm.boards.conic`.
         rms: (E,) root mean square distance of the edge points from the ellipse, px.
     """
 
@@ -51,7 +59,7 @@ def detect_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig
     """Bright elliptic discs on dark ground.
 
     Contours of the locally thresholded image give candidates; the edge of each is then measured along the normals of
-    its ellipse (centroid of the grey gradient), freed from lens distortion and fitted again.
+    its ellipse (centroid of the grey gradient), undistorted and fitted again.
 
     Args:
         gray: (H, W) uint8 image as the camera saw it.
@@ -62,7 +70,10 @@ def detect_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig
     centres: FloatArray = candidates[:, :2]
     shapes: FloatArray = _shapes(candidates)
     rms: FloatArray = np.zeros(len(candidates))
-    for lens in (camera.pinhole(), camera):  # the first round stays in the image: its ellipses guide the second
+    for lens in (
+        camera.pinhole(),
+        camera,
+    ):  # the first round leaves the lens distortion in: its ellipses guide the second in the image
         if not len(centres):
             break
         points, weights = _edge_points(gray, centres, shapes)
@@ -75,7 +86,7 @@ def detect_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig
 
 
 def _candidates(gray: NDArray[np.uint8], config: BoardConfig) -> FloatArray:
-    """(E, 5) ellipses x, y, semi-axis 1, semi-axis 2, angle of axis 1 [rad] around bright spots that are discs."""
+    """(E, 5) ellipses x, y, semi-axis 1, semi-axis 2, angle of axis 1 [rad] of bright regions that may be discs."""
     height, width = gray.shape
     # The window spans the rim of a disc and some ground; inside larger discs the offset keeps the flat interior white.
     window = max(15, width // 40) | 1
@@ -111,7 +122,7 @@ def _candidates(gray: NDArray[np.uint8], config: BoardConfig) -> FloatArray:
         if not (np.isfinite([x, y]).all() and least <= max(first, second) <= MAX_FLATTENING * min(first, second)):
             continue
         filled = (cv2.contourArea(contour) + 0.5 * len(contour)) / (np.pi * first * second)
-        if abs(filled - 1.0) <= 0.1 + 0.5 / min(first, second):
+        if abs(filled - 1.0) <= MAX_AREA_ERROR + AREA_ERROR_PX / min(first, second):
             found.append((x, y, first, second, np.deg2rad(degrees)))
     return np.array(found).reshape(-1, 5)
 
@@ -124,7 +135,7 @@ def _shapes(candidates: FloatArray) -> FloatArray:
 
 
 def _edge_points(gray: NDArray[np.uint8], centres: FloatArray, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Edge points (E, PROFILES, 2) [px of the image] on normals of ellipses, and weights (E, PROFILES) of 0 or 1."""
+    """Edge points (E, PROFILES, 2) on normals of ellipses, px of the image, and their 0/1 weights (E, PROFILES)."""
     angles = np.arange(PROFILES) * (2 * np.pi / PROFILES)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     values, vectors = np.linalg.eigh(shapes)
@@ -132,9 +143,8 @@ def _edge_points(gray: NDArray[np.uint8], centres: FloatArray, shapes: FloatArra
     rim = np.einsum("eij,ej,pj->epi", vectors, axes, circle)
     normals = np.einsum("eij,ej,pj->epi", vectors, 1.0 / axes, circle)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    # Wide enough for the blur of the edge, narrow enough to stay on this side of the disc's centre line.
-    reach = np.clip(0.6 * axes[:, 0], 1.5, 4.0)
-    count = int(2 * 4.0 / STEP) + 1
+    reach = np.clip(REACH * axes[:, 0], MIN_REACH, MAX_REACH)
+    count = int(2 * MAX_REACH / STEP) + 1
     offsets = np.linspace(-1.0, 1.0, count)[None, :] * reach[:, None]
     starts = centres[:, None] + rim
     samples = (starts[:, :, None] + normals[:, :, None] * offsets[:, None, :, None]).astype(np.float32)
@@ -143,22 +153,22 @@ def _edge_points(gray: NDArray[np.uint8], centres: FloatArray, shapes: FloatArra
     ).reshape(len(centres), PROFILES, count)
     falls = np.maximum(grey[..., :-1].astype(float) - grey[..., 1:].astype(float), 0.0)
     middles = 0.5 * (offsets[:, :-1] + offsets[:, 1:])
-    # A second pass around the steepest place keeps texture at the ends of the profile out of the centroid.
+    # The centroid of the steepest place alone, without texture at the ends of the profile.
     total = falls.sum(-1)
     peak = np.take_along_axis(np.broadcast_to(middles[:, None], falls.shape), falls.argmax(-1)[..., None], -1)
-    near = falls * (np.abs(middles[:, None] - peak) <= 1.8)
+    near = falls * (np.abs(middles[:, None] - peak) <= EDGE_HALF_WIDTH)
     shift = (near * middles[:, None]).sum(-1) / np.maximum(near.sum(-1), 1e-9)
     height, width = gray.shape
     inside = ((samples >= 0) & (samples <= np.array([width - 1, height - 1]))).all((-1, -2))
-    weights = (near.sum(-1) >= MIN_CONTRAST) & (near.sum(-1) >= 0.6 * total) & inside
+    weights = (near.sum(-1) >= MIN_CONTRAST) & (near.sum(-1) >= MIN_EDGE_SHARE * total) & inside
     return starts + normals * shift[..., None], weights.astype(float)
 
 
 def _fit(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Ellipses through (E, P, 2) points with 0/1 weights (E, P): centres, shapes, rms and which of them are good.
 
-    Points are scaled to a unit circle first, where the algebraic distance is twice the geometric one, so that the
-    linear fit is free of the algebraic bias; one rejection at three robust sigmas.
+    Points are scaled to a unit circle first, where the algebraic distance is twice the geometric one, which frees the
+    linear fit from its bias; outliers are rejected once.
     """
     used = np.maximum(weights.sum(1), 1.0)
     mean = (points * weights[..., None]).sum(1) / used[:, None]
@@ -177,14 +187,14 @@ def _fit(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArra
         masked = np.where(weights > 0, np.abs(distance), np.nan)
         empty = weights.sum(1) < 1
         masked[empty] = 0.0
-        limit = 3 * 1.4826 * np.nanmedian(masked, axis=1) + 0.02
+        limit = REJECTION * 1.4826 * np.nanmedian(masked, axis=1) + 0.02
         weights = weights * (np.abs(distance) <= limit[:, None])
     used = np.maximum(weights.sum(1), 1.0)
     rms = np.sqrt((weights * distance**2).sum(1) / used)
     a, b, c, d, e = solution.T
     quadratic = np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)
     determinant = a * c - b * b
-    good = (weights.sum(1) >= 0.75 * PROFILES) & (a > 0) & (determinant > 1e-3)
+    good = (weights.sum(1) >= MIN_PROFILES * PROFILES) & (a > 0) & (determinant > 1e-3)
     quadratic[~good] = np.eye(2)
     linear = np.stack([d, e], -1)
     centre = -np.linalg.solve(quadratic, linear[..., None])[..., 0]
@@ -202,7 +212,7 @@ def _plausible(shapes: FloatArray, config: BoardConfig) -> NDArray[np.bool_]:
 
 
 def _first_of_each(centres: FloatArray, shapes: FloatArray, rms: FloatArray) -> NDArray[np.intp]:
-    """Indices of ellipses of which each edge is held once: contours inside one another settle on the same edge."""
+    """Indices of ellipses, each edge once: contours inside one another converge to the same edge."""
     radius = axes_and_angle(shapes)[0][:, 0]
     order = np.lexsort((centres[:, 0], centres[:, 1], rms))
     kept: list[int] = []

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 
-MIN_SINE = np.sin(np.deg2rad(1.0))  # of the angle between two rays that give a point
+MIN_SINE = np.sin(np.deg2rad(1.0))  # of the angle between two rays; at less, depth errs by over 60 times as much
 
 
 def midpoints(

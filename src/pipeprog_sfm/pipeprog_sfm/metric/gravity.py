@@ -12,21 +12,23 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.metric.map_frame import Vertical
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
-MAX_DEVIATION = 0.5  # m/s^2: gravity varies by 0.03 over the Earth, cheap accelerometers err by a few tenths
-MIN_SECONDS = 2.0  # over which a hand's or a robot's own accelerations cancel
+MAX_DEVIATION = 0.5  # m/s^2: gravity varies by 0.05 over the Earth, the bias of cheap accelerometers by 0.3
+MIN_SECONDS = 2.0  # s; three steps of a walk, over which its accelerations average out
+MIN_SAMPLES = 10
+MAX_GAP = 0.2  # of the whole time, without any sample
 
 
 class GravityError(Exception):
-    """The accelerations tell no vertical; the text says why."""
+    """The accelerations give no vertical; the text says why."""
 
 
 def gravity(
     stamps: NDArray[np.int64], forces_in_camera: FloatArray, poses: Mapping[int, FloatArray], scale: float
 ) -> Vertical:
-    """Up in the model, from the mean of what an accelerometer felt on the way.
+    """Up in the model, from the weighted mean of specific forces along the way, less the camera's own acceleration.
 
-    With weights t (T - t) the camera's own accelerations integrate to its places, which the model knows: their mean is
-    12 / T^2 times the middle between first and last place less the mean place (integration by parts, twice).
+    With weights t (T - t) the mean of the camera's accelerations follows from its positions, which the model has: it
+    is 12 / T^2 times the midpoint of the first and last position less the mean position (integration by parts, twice).
 
     Args:
         stamps: (K,) of the accelerations [ns].
@@ -42,13 +44,13 @@ def gravity(
     inside = (stamps >= times[0]) & (stamps <= times[-1])
     at, forces = (stamps[inside] - times[0]) * 1e-9, forces_in_camera[inside]
     whole = float(seconds[-1])
-    if whole < MIN_SECONDS or len(at) < 10 or np.diff(np.r_[0.0, np.sort(at), whole]).max() > 0.2 * whole:
+    if whole < MIN_SECONDS or len(at) < MIN_SAMPLES or np.diff(np.r_[0.0, np.sort(at), whole]).max() > MAX_GAP * whole:
         raise GravityError("the accelerations of the IMU do not cover the keyframes: record them all the way")
     stack = np.stack(list(poses.values()))
     model_from_camera = Slerp(seconds, Rotation.from_matrix(stack[:, :3, :3].transpose(0, 2, 1)))
     order = np.argsort(at, kind="stable")
     at, forces = at[order], model_from_camera(at[order]).apply(forces[order])
-    # Samples may come in bursts: each counts for the time around it.
+    # Samples may come in bursts: each is weighted by the time around it.
     edges = np.r_[0.0, 0.5 * (at[1:] + at[:-1]), whole]
     weight = at * (whole - at) * np.diff(edges)
     felt = weight @ forces / weight.sum()

@@ -1,4 +1,4 @@
-"""What a robot knows of its own motion: frames moving in one another, and accelerations."""
+"""A robot's motion: transforms between frames as odometry and TF tell them, and accelerations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pipeprog_camera.arrays import FloatArray
 
-MAX_GAP = 500_000_000  # ns between two poses that are interpolated: a walker's step
+MAX_GAP = 500_000_000  # ns between two poses that are interpolated; one step of a walk takes as long
 ODOMETRY_FRAME = "odom"  # REP 105: continuous, while the frames above it may jump
 
 
@@ -39,7 +39,7 @@ class Acceleration:
 
 @dataclass(frozen=True)
 class RobotMotion:
-    """What has been told of a robot's motion, in any order."""
+    """Transforms and accelerations received, in any order."""
 
     transforms: tuple[Transform, ...] = ()
     accelerations: tuple[Acceleration, ...] = ()
@@ -69,7 +69,7 @@ class TransformTree:
         return bool(self._moving)
 
     def add(self, transforms: Iterable[Transform]) -> None:
-        """Takes transforms in any order; what they come to does not depend on it."""
+        """Takes transforms in any order; the result does not depend on it."""
         for transform in transforms:
             if transform.static:
                 self._static[transform.child] = transform
@@ -129,7 +129,7 @@ class TransformTree:
         return np.linalg.inv(above[frame]) @ pose
 
     def _parent(self, child: str) -> str:
-        """The frame above, "" at the root; of several the one that was told most often."""
+        """The frame above, "" at the root; of several the one that occurs most often."""
         if child in self._static:
             return self._static[child].parent
         parents = self._moving.get(child, {})

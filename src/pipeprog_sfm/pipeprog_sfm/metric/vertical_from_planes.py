@@ -1,4 +1,4 @@
-"""The direction up, from what was built: floors and ceilings are level, walls and columns are plumb."""
+"""The direction up from planes: floors and ceilings are horizontal, walls and columns vertical."""
 
 from __future__ import annotations
 
@@ -8,32 +8,34 @@ from scipy.spatial import cKDTree
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.metric.map_frame import Vertical
 
-MAX_POINTS = 5000  # whose normals are estimated
-NEIGHBOURS = 16
-FLATNESS = 0.1  # largest share of the spread of a point's neighbours that is across their plane
-ROUNDNESS = 0.2  # smallest of the two along it: neighbours on a line have no plane
-ANGLE_GATES = np.radians([25.0, 15.0, 10.0])  # from how a camera is held to how well normals of sparse points are known
-MIN_NORMALS = 200
-MIN_SHARE = 0.5  # of the normals that are level or plumb, where a third would be by chance
-MIN_STIFFNESS = 0.1  # share of the normals that resist a tilt: one wall alone leaves one free
+MAX_POINTS = 5000  # whose normals are estimated: bounds the time
+NEIGHBOURS = 16  # of a point: enough to measure the spread across their plane
+FLATNESS = 0.1  # largest variance across the plane of the neighbours, of the sum of all three
+ROUNDNESS = 0.2  # smallest ratio of the two variances in the plane: neighbours on a line have none
+ANGLE_GATES = np.radians(
+    [25.0, 15.0, 10.0]
+)  # of a normal from its direction: first how upright a camera is held, last the noise of normals
+MIN_NORMALS = 200  # a share of them is then known to 4 %
+MIN_SHARE = 0.5  # of the normals, within 10 degrees of horizontal or vertical; 19 % of random directions are
+MIN_STIFFNESS = 0.1  # gap of the two smallest eigenvalues, a share of the normals: with a single wall it is zero
 
 
 class PlanesError(Exception):
-    """The surroundings tell no vertical; the text says why."""
+    """The surroundings give no vertical; the text says why."""
 
 
 def vertical_from_planes(points_in_model: FloatArray, camera_up: FloatArray) -> Vertical:
     """Up in the model, from the normals of the surfaces that its points lie on.
 
-    The sum of squares of n.u over plumb and of 1 - (n.u)^2 over level surfaces is least for the smallest eigenvector
-    of a matrix; which are which follows from how the cameras were held, then from the result.
+    The sum of (n.u)^2 over vertical and of 1 - (n.u)^2 over horizontal surfaces is least for the eigenvector of the
+    smallest eigenvalue of a matrix; which surface is which follows from how the cameras were held, then from the fit.
 
     Args:
         points_in_model: (N, 3) sparse points.
         camera_up: (3,) unit vector, up as the cameras were held, to 25 degrees.
 
     Raises:
-        StructureError: too few surfaces, or not plumb and level ones.
+        PlanesError: too few surfaces, or not horizontal and vertical ones.
     """
     normals = _normals(points_in_model)
     up = camera_up
@@ -41,11 +43,11 @@ def vertical_from_planes(points_in_model: FloatArray, camera_up: FloatArray) -> 
     if len(normals) >= MIN_NORMALS:
         for gate in ANGLE_GATES:
             along = np.abs(normals @ up)
-            level, plumb = normals[along > np.cos(gate)], normals[along < np.sin(gate)]
-            matrix = plumb.T @ plumb - level.T @ level + len(level) * np.eye(3)
+            horizontal, vertical = normals[along > np.cos(gate)], normals[along < np.sin(gate)]
+            matrix = vertical.T @ vertical - horizontal.T @ horizontal + len(horizontal) * np.eye(3)
             values, vectors = np.linalg.eigh(matrix / len(normals))
             up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
-            share, stiffness = (len(level) + len(plumb)) / len(normals), float(values[1] - values[0])
+            share, stiffness = (len(horizontal) + len(vertical)) / len(normals), float(values[1] - values[0])
     if share < MIN_SHARE or stiffness < MIN_STIFFNESS:
         raise PlanesError("the surroundings show no floor, or no walls of two directions, that would tell what is up")
     return Vertical(up, "floor and walls")
