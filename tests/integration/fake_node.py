@@ -45,7 +45,7 @@ class FakeNode(Node):
         {"frames": self._be_frames, "sfm": self._be_sfm, "detect": self._be_detect}[self._role]()
         if f"child of {self._role}" == FAULT:
             child = subprocess.Popen(["sleep", "300"])
-            Path(os.environ["FAKE_PIDS"]).write_text(f"{os.getpid()} {child.pid}")
+            Path(os.environ["FAKE_FOLDER"], "pids").write_text(f"{os.getpid()} {child.pid}")
 
     def _report(self) -> None:
         self._diagnostics.publish(DiagnosticArray(status=[DiagnosticStatus(name=f"{self._role}: fake")]))
@@ -90,6 +90,8 @@ class FakeNode(Node):
         self._infos += 1
 
     def _on_image(self, message: CompressedImage | Image) -> None:
+        if not self._inputs:
+            Path(os.environ["FAKE_FOLDER"], "playing").touch()
         self._inputs.append(messages.stamp_ns(message.header.stamp))
         self._undecided.append(message)
         while self._images.get_subscription_count() < 2:  # as the real selector waits for those who listen

@@ -30,6 +30,7 @@ from pipeprog_camera.camera import Camera
 
 ROOT = Path(__file__).parents[2]
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+PLAYING = 110.0  # s that 23 frames, 0.1 s apart, last at a rate of 0.02
 START = 1_700_000_000_000_000_000
 BOQ = "classes: [{name: DN65, outer_radius_mm: 36.5, planned_length_m: 3.0}]\n"
 RUNNER = """
@@ -74,7 +75,7 @@ def start(folder: Path, *options: str, fault: str = "", **recording: int) -> sub
     (folder / "boq.yaml").write_text(BOQ)
     arguments = ["replay", str(bag), "--boq", str(folder / "boq.yaml"), "--out", str(folder / "out"), *options]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    told = {"FAKE": fault, "FAKE_PIDS": str(folder / "pids")}
+    told = {"FAKE": fault, "FAKE_FOLDER": str(folder)}
     environment = {**os.environ, **told, "PYTHONPATH": path, "TMPDIR": str(folder)}
     return subprocess.Popen(
         [sys.executable, "-c", RUNNER, *arguments],
@@ -155,12 +156,10 @@ def test_what_a_robot_tells_of_its_motion_reaches_the_sfm(tmp_path: Path) -> Non
 @pytest.mark.parametrize("node", ["frames", "sfm", "detect"])
 def test_a_killed_node_is_named_and_leaves_no_orphans(tmp_path: Path, node: str) -> None:
     process = start(tmp_path, "--rate", "0.02", fault=f"child of {node}")
-    nodes = wait_for(lambda: (tmp_path / "pids").exists() and nodes_of(process.pid))
-    time.sleep(0.5)
+    wait_for(lambda: (tmp_path / "playing").exists() and (tmp_path / "pids").exists())
+    nodes = nodes_of(process.pid)
     os.kill(nodes[node], signal.SIGKILL)
-    killed = time.monotonic()
-    _, errors = process.communicate(timeout=30)
-    assert time.monotonic() - killed < 10
+    _, errors = process.communicate(timeout=PLAYING / 2)
     assert process.returncode == 1
     assert f"the node {node} " in errors
     assert "SIGKILL" in errors
@@ -181,10 +180,10 @@ def test_a_node_that_dies_at_the_end_is_named_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupt_ends_all_and_writes_nothing(tmp_path: Path, number: signal.Signals, code: int) -> None:
     process = start(tmp_path, "--rate", "0.02")
-    nodes = wait_for(lambda: len(nodes_of(process.pid)) == 3 and nodes_of(process.pid))
-    time.sleep(1.0)
+    wait_for((tmp_path / "playing").exists)
+    nodes = nodes_of(process.pid)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PLAYING / 2)
     assert process.returncode == code
     assert "Traceback" not in errors
     assert not (tmp_path / "out").exists()
@@ -196,7 +195,7 @@ def test_the_nodes_end_with_a_command_that_is_killed(tmp_path: Path) -> None:
     nodes = wait_for(lambda: len(nodes_of(process.pid)) == 3 and nodes_of(process.pid))
     process.kill()
     process.communicate()
-    wait_for(lambda: not any(is_running(pid) for pid in nodes.values()), 5.0)
+    wait_for(lambda: not any(is_running(pid) for pid in nodes.values()))
 
 
 def test_without_a_scale_the_reason_is_told_and_nothing_written(tmp_path: Path) -> None:

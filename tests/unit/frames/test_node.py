@@ -92,12 +92,14 @@ class Stage:
 
     def show(self, stamp: int, image: Image | CompressedImage) -> None:
         """One image with its calibration, and all that follows from it."""
-        considered = len(self.decisions)
+        considered = self._counted("frames considered")
         self._infos.publish(messages.info_from_camera(CAMERA, stamp, image.header.frame_id))
         self._images.publish(image)
-        deadline = time.monotonic() + 0.3
-        while len(self.decisions) == considered and time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.01)
+        self.spin_until(lambda: self._counted("frames considered") > considered)
+        self.spin_until(lambda: len(self.keyframes) == self._counted("keyframes"))
+
+    def _counted(self, what: str) -> int:
+        return int(self.node._health()[2][what])
 
     def publish_answer(self, message: ImageOverlapArray) -> None:
         self._overlaps.publish(message)

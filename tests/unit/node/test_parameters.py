@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -104,13 +103,12 @@ run(Tested)
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_node_that_is_told_to_stop_exits_with_0(number: signal.Signals) -> None:
-    program = PROGRAM.format(body="print('up', flush=True)")
+    program = PROGRAM.format(body="self.create_timer(0.01, lambda: print('up', flush=True))")  # says that it spins
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "up\n"
-    time.sleep(0.2)  # into spin
     process.send_signal(number)
     _, errors = process.communicate(timeout=20)
     assert (process.returncode, errors) == (0, "")

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -162,7 +161,6 @@ def test_a_killed_run_leaves_no_final_name(tmp_path: Path) -> None:
     assert process.stdout.readline() == b"ready\n"
     process.kill()
     process.wait()
-    time.sleep(0.05)
     assert not (tmp_path / "results" / "pipes.json").exists()
     run(tmp_path / "results", {"pipes.json": "new"})
     assert names(tmp_path / "results") == ["pipes.json", "run.json"]
