@@ -10,7 +10,9 @@ from pipeprog_sfm.boards.board_print import POINTS_PER_MM, board_pdf
 
 def test_circles_have_their_true_size_and_places():
     text = board_pdf([LOPSIDED], "A2").decode("ascii")
-    factor = float(re.search(r"([\d.]+) 0 0 [\d.]+ 0 0 cm", text)[1])
+    scaling = re.search(r"([\d.]+) 0 0 [\d.]+ 0 0 cm", text)
+    assert scaling is not None
+    factor = float(scaling[1])
     discs = re.findall(r"([\d.]+) ([\d.]+) m\n((?:[\d. ]+ c\n){4})f", text)
     places = []
     for _, _, curves in discs:
@@ -23,7 +25,9 @@ def test_circles_have_their_true_size_and_places():
 
 def test_every_object_is_where_the_table_says():
     document = board_pdf([LOPSIDED, BOARD], "A1")
-    start = int(re.search(rb"startxref\n(\d+)", document)[1])
+    table = re.search(rb"startxref\n(\d+)", document)
+    assert table is not None
+    start = int(table[1])
     offsets = re.findall(rb"(\d{10}) 00000 n", document[start:])
     assert document.count(b"/Type /Page ") == 2
     for number, offset in enumerate(offsets, 1):

@@ -65,8 +65,8 @@ def test_conic_score_tells_the_same_circle_from_another():
     poses = [camera_from_board(place, (0, 0, 0)) for place in ((-0.6, 0.1, 2.0), (0.7, -0.1, 1.8))]
     centres = np.array([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0]])
     conics = [conic_from_ellipse(*project_circles(CAMERA.matrix, pose, centres, RADIUS)) for pose in poses]
-    cameras = [CAMERA.matrix @ pose[:3] for pose in poses]
+    one, other = (CAMERA.matrix @ pose[:3] for pose in poses)
     origins = np.stack([centres[0], centres.mean(0)])
-    true, wrong = conic_score(conics[0][[0, 0]], conics[1], *cameras, origins)
+    true, wrong = conic_score(conics[0][[0, 0]], conics[1], one, other, origins)
     assert true < 1e-6
     assert wrong > 0.1

@@ -149,7 +149,7 @@ def far_apart(seed, views=24):
 
 
 def test_a_known_distance_between_boards_sharpens_the_scale():
-    walk, length = far_apart(1), np.linalg.norm([6.0 + 0.06, 0.02])
+    walk, length = far_apart(1), float(np.linalg.norm([6.0 + 0.06, 0.02]))
     distance = KnownDistance("A/1 to B/1", (("A", 0), ("B", 0)), length, 0.0002)
     alone, both = told(walk, (BOARD, LOPSIDED)), told(walk, (BOARD, LOPSIDED), distances=(distance,))
     assert alone.source == "board"

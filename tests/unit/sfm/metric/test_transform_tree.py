@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from targets import CAMERA
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import OdometryConfig
 from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.gravity import STANDARD_GRAVITY, GravityError, gravity
@@ -67,7 +68,8 @@ class Robot:
     def tree(self, noise=0.0, stretch=1.0, rate=20):
         """Odometry in a frame of its own, and where the camera is mounted."""
         odom_from_world = pose_of(Rotation.from_rotvec([0, 0, 0.7]), [4.0, -1.0, 0.0])
-        tree, drift, last = TransformTree(), np.zeros(3), None
+        tree, last = TransformTree(), None
+        drift: FloatArray = np.zeros(3)
         samples = []
         for t in np.arange(-0.1, self.seconds + 0.2, 1 / rate):
             pose = self.world_from_base(t)
