@@ -307,7 +307,7 @@ class DriftingWalk:
         free = np.ones(views, bool)
         free[0] = False
         loss_scale = 2.385 * 0.3
-        result = adjust(truth, free, loss_scale=loss_scale, max_iterations=30, tolerance=1e-10).bundle
+        result = adjust(truth, free, loss_scale=loss_scale, max_iterations=30, tolerance=1e-10)
         self.poses = {}
         for stamp in range(views):
             self.poses[stamp] = true[stamp].copy()
