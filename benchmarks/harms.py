@@ -69,7 +69,7 @@ HARMS = {
         "bringup/test_score.py",
     ),
     "no end from rims": Harm(
-        "pipeprog_detect.silhouette.contour_refinement.find_end", lambda _: lambda *_, **__: None, "detect"
+        "pipeprog_detect.silhouette.pipe_ends.find_end", lambda _: lambda *_, **__: None, "detect"
     ),
 }
 

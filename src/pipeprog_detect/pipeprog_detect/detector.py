@@ -19,13 +19,12 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.interior_search import find_concave
 from pipeprog_detect.product import classification
 from pipeprog_detect.product.boq import BillOfQuantities
-from pipeprog_detect.silhouette.apparent_contour import viewing_direction
-from pipeprog_detect.silhouette.edge_support import own_contours
 from pipeprog_detect.silhouette.occlusion import with_depths
+from pipeprog_detect.silhouette.scene import viewing_direction
 from pipeprog_detect.thin.thin_pipes import find_thin_pipes
 from pipeprog_detect.types import Cloud, Pipe, View
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined, own_contours
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import with_ends_on_walls

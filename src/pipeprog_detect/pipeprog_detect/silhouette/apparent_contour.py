@@ -1,4 +1,4 @@
-"""The apparent contour of a circular cylinder: its two image lines in a view, and how they move with the cylinder."""
+"""The apparent contour of a circular cylinder: its two image lines in a view, and how they move with it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from pipeprog_detect.types import Cylinder, View
 NEAR_PLANE = 0.05
 # Positions along the axis are equal to a micrometre: samples of all views share them but for rounding.
 POSITION_DIGITS = 6
+# Samples of one side that are fewer than this share of the other's are gaps between the cylinders that hide it.
+GAPS = 0.1
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ class ContourSamples:
         along: position (N,) on the axis from the cylinder's middle [m].
         gain: displacement (N,) of the line for one metre of the surface [px/m].
         half_width: apparent radius (N,) of the pipe [px].
-        jacobian: (N, 5) outward displacement [px] for one metre of each component of the step of `moved`.
+        jacobian: (N, 5) outward displacement [px] for one metre of each component of a step: offsets along the basis
+            of the axis' start (2) and end (2), and of the radius.
     """
 
     view: IntArray
@@ -56,6 +59,11 @@ class ContourSamples:
         """Sign (N,) of the outward displacement that a shift of the whole pipe towards side 0 causes."""
         return np.where(self.side == 0, 1.0, -1.0)
 
+    def shows_both_sides(self) -> bool:
+        """Whether they lie on both sides, more of them than gaps in what hides one side let through."""
+        count = np.bincount(self.side, minlength=2)
+        return bool(count.min() > GAPS * count.max())
+
     def positions(self) -> tuple[FloatArray, IntArray]:
         """The distinct positions (B,) along the axis [m], and the index (N,) of each sample's own among them."""
         along, index = np.unique(np.round(self.along, POSITION_DIGITS), return_inverse=True)
@@ -79,32 +87,6 @@ def tangent_normals(cylinder: Cylinder, centre: FloatArray) -> FloatArray | None
     sine = radius / distance
     cosine = np.sqrt(1.0 - sine * sine)
     return np.stack([sine * towards + cosine * across, sine * towards - cosine * across])
-
-
-def frame(cylinder: Cylinder, towards: FloatArray) -> FloatArray:
-    """Two unit vectors (2, 3) across the axis: sideways as seen along `towards`, and away from the viewer."""
-    axis = cylinder.axis
-    depth = towards - axis * (axis @ towards)
-    norm = float(np.linalg.norm(depth))
-    if norm < 1e-6:
-        depth = np.eye(3)[np.argmin(np.abs(axis))]
-        depth = depth - axis * (axis @ depth)
-        norm = float(np.linalg.norm(depth))
-    depth = depth / norm
-    return np.stack([np.cross(axis, depth), depth])
-
-
-def viewing_direction(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
-    """Mean unit vector (3,) from the cameras to the cylinder's middle."""
-    directions = [cylinder.middle - view.centre for view in views]
-    return np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
-
-
-def moved(cylinder: Cylinder, basis: FloatArray, step: FloatArray) -> Cylinder:
-    """The cylinder after a step (5,): offsets of its start (2) and end (2) along `basis` and of its radius [m]."""
-    return Cylinder(
-        cylinder.start + step[0:2] @ basis, cylinder.end + step[2:4] @ basis, float(cylinder.radius + step[4])
-    )
 
 
 def project(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -138,7 +120,7 @@ def contour_samples(
     """Samples farther than `margin` [px] inside the images, about `spacing` [px] apart in the median view.
 
     The positions along the axis are common to all views, so that evidence can be pooled by position. `basis` (2, 3):
-    the directions of the step (see `moved`) of which the Jacobian is taken.
+    the directions across the axis of which the Jacobian is taken.
     """
     gains = [view.camera.fx / max(float(np.linalg.norm(view.centre - cylinder.middle)), 1e-3) for view in views]
     step = spacing / float(np.median(gains))

@@ -19,12 +19,12 @@ from pipeprog_detect.types import Cylinder, View
 ROBUST, FLOOR = 0.3, 0.1
 # Edges placed worse than this standard deviation [px] do not count: the pixel is then the better estimate.
 WORST_EDGE = 0.7
+# The limb model's own error, common to all views: a tenth of a sharp image's blur [px].
+MODEL_ERROR = 0.05
 # Rounds of the robust weights, and standard deviation of the views' offsets [px] in the first and at the least.
 ROUNDS, FIRST_OFFSET, LEAST_OFFSET = 25, 0.5, 0.02
 # Distance of edges from the contour of the search, and from the refined one [px], and passes over the latter.
 COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
-# On a thin pipe edges count within this share of its half-width, to keep off the other line and the highlight [px].
-THIN_REACH, LEAST_REACH = 0.3, 0.6
 # Samples that a candidate step is judged by, and the least that measure a cylinder (five unknowns, four of each).
 COARSE_SAMPLES, MIN_SAMPLES = 1200, 20
 
@@ -34,71 +34,92 @@ class AdjustedCylinder:
     """A cylinder after least squares on its limb edges.
 
     Attributes:
-        cylinder: the cylinder after the step.
+        scene: of the cylinder after the step, with the offset of each view.
         step: (5,) from the given cylinder to it; see `Scene.moved`.
         covariance: (5, 5) of the step [m^2].
-        view_offset: (V,) sideways offset of each view [px].
         used: mask (N,) of the samples of which an edge counted.
         share: support (0 to 1) of its contour.
         samples: the N contour samples.
         edges: their limb edges.
     """
 
-    cylinder: Cylinder
+    scene: Scene
     step: FloatArray
     covariance: FloatArray
-    view_offset: FloatArray
     used: NDArray[np.bool_]
     share: float
     samples: ContourSamples
     edges: LimbEdges
 
+    @property
+    def cylinder(self) -> Cylinder:
+        """The cylinder after the step."""
+        return self.scene.cylinder
 
-def adjusted(cylinder: Cylinder, scene: Scene, prior: FloatArray, so_far: FloatArray) -> AdjustedCylinder | None:
-    """The cylinder after some passes of least squares, the edges sought anew in each; None where none is left.
 
-    `prior` (5, 5): precision [1/m^2] of the start, from which `so_far` (5,) has led to `cylinder`.
+def adjusted(scene: Scene, prior: FloatArray, so_far: FloatArray) -> AdjustedCylinder | None:
+    """The scene's cylinder after some passes of least squares, the edges sought anew in each; None if none is left.
+
+    `prior` (5, 5): precision [1/m^2] of the start, from which `so_far` (5,) has led to the cylinder.
     """
-    scene = scene.shifted(np.zeros(len(scene.views)))
+    scene = replace(scene, view_offset=np.zeros(len(scene.views)))
     step: FloatArray = np.zeros(5)
     for _ in range(FINE_PASSES):
-        current = scene.moved(cylinder, step)
-        if current.radius <= 0:
+        found = _pass(scene, step, prior, so_far + step, FINE_REACH)
+        if found is None:
             return None
-        samples, edges = scene.edges(current, _reach(current, scene, FINE_REACH))
-        if len(samples) < MIN_SAMPLES:
-            return None
-        solution = _solve(samples, edges, len(scene.views), prior, so_far + step)
+        samples, edges, solution = found
         step = step + solution.step
-        scene = scene.shifted(solution.view_offset)
-    found = scene.moved(cylinder, step)
-    if found.radius <= 0:
+        scene = replace(scene, view_offset=solution.view_offset)
+    scene = scene.moved(step)
+    if scene.cylinder.radius <= 0:
         return None
-    hit = hits(samples, edges.shifted(-(samples.jacobian @ solution.step)), scene.view_offset)
-    share = support_profile(samples, hit).share
-    return AdjustedCylinder(
-        found, step, solution.covariance, solution.view_offset, solution.used, share, samples, edges
-    )
+    share = support_profile(samples, hits(edges, solution.displacement)).share
+    return AdjustedCylinder(scene, step, solution.covariance, solution.used, share, samples, edges)
 
 
-def best_of(cylinder: Cylinder, scene: Scene, steps: Sequence[FloatArray], prior: FloatArray) -> FloatArray:
-    """Of candidate steps (5,) the one that, after one pass on sub-pixel edges, explains most samples; so improved."""
-    return max((_improved(cylinder, scene, step, prior) for step in steps), key=lambda trial: trial[1])[0]
+def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
+    """Of candidate steps (K, 5) the one that, after a pass on sub-pixel edges, explains most samples; so improved."""
+    trials = []
+    for step in steps:
+        found = _pass(scene, step, prior, step, COARSE_REACH, COARSE_SAMPLES)
+        if found is None:
+            trials.append((step, 0.0))
+        else:
+            _, edges, solution = found
+            trials.append((step + solution.step, float(hits(edges, solution.displacement).mean())))
+    return max(trials, key=lambda trial: trial[1])[0]
 
 
-def _improved(cylinder: Cylinder, scene: Scene, step: FloatArray, prior: FloatArray) -> tuple[FloatArray, float]:
-    """A candidate step after one pass of least squares, and the share of samples that it explains."""
-    current = scene.moved(cylinder, step)
-    samples, edges = scene.edges(current, _reach(current, scene, COARSE_REACH), limit=COARSE_SAMPLES)
+def _pass(
+    scene: Scene, step: FloatArray, prior: FloatArray, so_far: FloatArray, reach: float, limit: int | None = None
+) -> tuple[ContourSamples, LimbEdges, _Solution] | None:
+    """Least squares from the scene's cylinder after a `step` (5,).
+
+    Args:
+        scene: the cylinder in its views.
+        step: of the cylinder.
+        prior: precision (5, 5) of the start [1/m^2].
+        so_far: (5,) from that start to the cylinder after the step.
+        reach: distance of edges from the contour [px].
+        limit: about how many samples are used; all if None.
+
+    Returns:
+        The samples, their edges and the solution; None where too few are visible or no cylinder is left.
+    """
+    current = scene.moved(step)
+    if current.cylinder.radius <= 0:
+        return None
+    reach = current.within(reach)
+    samples, edges = current.edges(reach, limit=limit)
     if len(samples) < MIN_SAMPLES:
-        return step, 0.0
-    solution = _solve(samples, edges, len(scene.views), prior, step)
-    explained = hits(samples, edges.shifted(-(samples.jacobian @ solution.step)), solution.view_offset)
-    return step + solution.step, float(explained.mean())
+        return None
+    return samples, edges, _solve(samples, edges, len(scene.views), prior, so_far)
 
 
-def flatness(found: AdjustedCylinder, views: Sequence[View]) -> tuple[float, float]:
+def flatness(found: AdjustedCylinder) -> tuple[float, float]:
     """Share of a flat strip's displacement in the edges, beside a step of the cylinder, and its standard deviation."""
+    views = found.scene.views
     strip = _as_strip(found.samples, found.cylinder, views)
     widened = replace(found.samples, jacobian=np.column_stack([found.samples.jacobian, strip]))
     solution = _solve(widened, found.edges, len(views), np.zeros((6, 6)), np.zeros(6))
@@ -118,20 +139,22 @@ def _as_strip(samples: ContourSamples, cylinder: Cylinder, views: Sequence[View]
     return np.asarray(samples.half_width * (towards @ facing - 1.0)[samples.view], np.float64)
 
 
-def _reach(cylinder: Cylinder, scene: Scene, pixels: float) -> float:
-    """`pixels`, but less on a thin pipe, whose two contour lines and highlight lie within a few pixels."""
-    distance = [np.linalg.norm(view.centre - cylinder.middle) for view in scene.views]
-    half_width = [view.camera.fx * cylinder.radius / each for view, each in zip(scene.views, distance, strict=True)]
-    return float(min(pixels, max(THIN_REACH * np.median(half_width), LEAST_REACH)))
-
-
 @dataclass(frozen=True)
 class _Solution:
-    """A step (K,), its covariance (K, K), the sideways offset (V,) of each view [px], and mask (N,) of samples used."""
+    """The result of least squares.
+
+    Attributes:
+        step: (K,) of the unknowns.
+        covariance: (K, K) of the step.
+        view_offset: (V,) sideways offset of each view [px].
+        displacement: (N,) of the samples outwards, by step and offset [px].
+        used: mask (N,) of the samples of which an edge counted.
+    """
 
     step: FloatArray
     covariance: FloatArray
     view_offset: FloatArray
+    displacement: FloatArray
     used: NDArray[np.bool_]
 
 
@@ -178,7 +201,8 @@ def _solve(samples: ContourSamples, edges: LimbEdges, views: int, prior: FloatAr
     freed = weighted - (weight * sign)[:, None] * (cross / own[:, None])[samples.view]
     spread = _clustered(weighted * remaining[:, None], samples.view, used)
     spread = spread + _clustered(freed * remaining[:, None], samples.positions()[1], used)
-    return _Solution(step, inverse @ spread @ inverse + inverse, offset, used)
+    displacement = jacobian @ step + sign * offset[samples.view]
+    return _Solution(step, inverse @ spread @ inverse + inverse, offset, displacement, used)
 
 
 def _clustered(scores: FloatArray, group: IntArray, used: NDArray[np.bool_]) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +11,6 @@ from scipy.special import betainc
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.limb_edges import LimbEdges
-from pipeprog_detect.silhouette.scene import Scene
-from pipeprog_detect.types import Cylinder, View
 
 # An edge supports a contour sample where it lies within the sharpness of the image [px], ...
 NEAR = 0.6
@@ -28,8 +25,6 @@ HIT_RATE = 0.7
 # Support of what is taken for seen: the geometric mean of 0.55, which nine in ten of the pipes of that field reach, and
 # of 0.1, under which nine in ten cylinders stay that are placed beside them. MeasuredPipe there as well.
 MIN_SUPPORT = 0.25
-# Distance from the predicted contour within which its support is counted [px].
-REACH = 1.5
 
 
 @dataclass(frozen=True)
@@ -40,11 +35,13 @@ class SupportProfile:
         along: position (B,) from the cylinder's middle [m].
         seen: number (B, 2) of views that see each side there.
         hits: number (B, 2) of those that show a limb edge there.
+        gain: median displacement of the contour for one metre of the surface [px/m].
     """
 
     along: FloatArray
     seen: FloatArray
     hits: FloatArray
+    gain: float = float("nan")
 
     @property
     def share(self) -> float:
@@ -70,9 +67,9 @@ class SupportProfile:
         return (self.hits >= needed).sum(axis=0).astype(float), expected.sum(axis=0)
 
 
-def hits(samples: ContourSamples, edges: LimbEdges, view_offset: FloatArray) -> NDArray[np.bool_]:
-    """Mask (N,) of the samples that an edge supports, the contour being shifted by the views' offsets (V,) [px]."""
-    distance = np.abs(edges.offset - (samples.sideways() * view_offset[samples.view])[:, None])
+def hits(edges: LimbEdges, displacement: FloatArray) -> NDArray[np.bool_]:
+    """Mask (N,) of the samples that an edge supports, the contour being displaced outwards by (N,) [px] there."""
+    distance = np.abs(edges.offset - displacement[:, None])
     good = (distance < NEAR) & (edges.sigma < SIGMA) & (edges.explained > EXPLAINED)
     return np.asarray(good.any(axis=1), bool)
 
@@ -83,25 +80,5 @@ def support_profile(samples: ContourSamples, hit: NDArray[np.bool_]) -> SupportP
     cell = 2 * position + samples.side
     seen = np.bincount(cell, np.ones(len(cell)), 2 * len(along)).reshape(-1, 2)
     found = np.bincount(cell, hit.astype(float), 2 * len(along)).reshape(-1, 2)
-    return SupportProfile(along, np.asarray(seen, float), np.asarray(found, float))
-
-
-def contour_support(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> SupportProfile:
-    """Support of a cylinder's predicted contour by the edges near it; `others` may hide it."""
-    scene = Scene.of(cylinder, views, others)
-    samples, edges = scene.edges(cylinder, REACH)
-    return support_profile(samples, hits(samples, edges, scene.view_offset))
-
-
-def own_contours(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArray[np.bool_]:
-    """Mask (N,) of the cylinders whose contours are their own once all of them are known.
-
-    A cylinder that was measured before the one that hides it was found may have been fitted to that one's edges:
-    without them its support falls below `MIN_SUPPORT`. One that never had that support is not judged by it.
-    """
-    kept = np.ones(len(cylinders), bool)
-    for number, cylinder in enumerate(cylinders):
-        others = [other for k, other in enumerate(cylinders) if k != number and kept[k]]
-        if contour_support(cylinder, views, others).share < MIN_SUPPORT:
-            kept[number] = contour_support(cylinder, views, []).share < MIN_SUPPORT
-    return kept
+    gain = float(np.median(samples.gain)) if len(samples) else float("nan")
+    return SupportProfile(along, np.asarray(seen, float), np.asarray(found, float), gain)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.edge_support import SupportProfile, hits, support_profile
+from pipeprog_detect.silhouette.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
+from pipeprog_detect.silhouette.edge_support import SupportProfile
+from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder
 
@@ -37,6 +39,21 @@ LEAST = 0.04
 # The direction's error, at the end of the stretch looked at, moves the contour by less than this [px].
 TOLERANCE = 1.5
 
+# Standard deviation [m] to which a known radius is held until the pipe's own edges are found.
+RADIUS_HELD = 1e-4
+# Standard deviations within which what is known of a direction is sought.
+SURELY = 3.0
+# A pipe of which a piece is known is extended so many times at most, each time up to its own length at either end.
+MAX_EXTENSIONS = 6
+# An extension is rejected (radius and axis stay those known before) if support drops below this share of its former
+# value, if the radius changes by more than this many standard deviations, ...
+WORSE, SAME_RADIUS = 0.9, 3.0
+# ... or if the axis moves by more than this (chi square of four degrees of freedom, exceeded once in a thousand times)
+# and by more than this share of the radius: it then follows a pipe beside it.
+SAME_AXIS, ASIDE = 18.5, 0.5
+# With less than this share of the former support it is not extended at all: there is something else.
+LOST = 0.5
+
 
 @dataclass(frozen=True)
 class AxialEvidence:
@@ -54,48 +71,117 @@ class AxialEvidence:
     seen: FloatArray
 
 
-def extended(cylinder: Cylinder, scene: Scene) -> Cylinder:
-    """The cylinder, as long as its contour is seen; the same one where nothing is to be added.
+def followed(known: AdjustedCylinder, prior: FloatArray, held: FloatArray) -> AdjustedCylinder:
+    """A pipe of which a piece is known, as long as its contour is seen.
+
+    `prior` (5, 5): precision [1/m^2] of the piece's start; `held`: the same with the radius held.
+    """
+    for _ in range(MAX_EXTENSIONS):
+        length = known.cylinder.length
+        longer = extended(known.scene)
+        if longer.length < length + LEAST:
+            turned = _turned(known, held)
+            longer = longer if turned is None else extended(turned)
+        if longer.length < length + LEAST:
+            break
+        # The prior's direction came from the shorter piece: the longer one's ends are more uncertain by their ratio.
+        weaker = prior * (length / longer.length) ** 2
+        again = adjusted(known.scene.turned_to(longer), weaker, np.zeros(5))
+        if again is None or again.share < LOST * known.share:
+            break
+        if again.share < WORSE * known.share or _widens(again, known) or _strays(again.cylinder, known):
+            # There may be more of the pipe that measures it less well.
+            known = replace(known, scene=replace(known.scene, cylinder=longer))
+        else:
+            known = again
+    return known
+
+
+def _widens(longer: AdjustedCylinder, known: AdjustedCylinder) -> bool:
+    """Whether a longer cylinder has another radius than the known one."""
+    sigma = np.sqrt(known.covariance[4, 4] + (MODEL_ERROR / np.median(longer.samples.gain)) ** 2)
+    return bool(abs(longer.cylinder.radius - known.cylinder.radius) > SAME_RADIUS * sigma)
+
+
+def _strays(longer: Cylinder, known: AdjustedCylinder) -> bool:
+    """Whether the axis of a longer cylinder leaves the ends of the known one."""
+    ends = np.stack([known.cylinder.start, known.cylinder.end]) - longer.start
+    aside = (np.outer(ends @ longer.axis, longer.axis) - ends) @ known.scene.basis.T
+    offset = aside.ravel()
+    systematic = MODEL_ERROR / float(np.median(known.samples.gain))
+    covariance = known.covariance[:4, :4] + systematic**2 * np.eye(4)
+    surely = float(offset @ np.linalg.solve(covariance, offset)) > SAME_AXIS
+    return surely and float(np.linalg.norm(aside, axis=1).max()) > ASIDE * known.cylinder.radius
+
+
+def _turned(known: AdjustedCylinder, held: FloatArray) -> Scene | None:
+    """The known cylinder in the direction that most edges ahead of it agree with.
+
+    None where its direction is known well enough to look ahead, or where too little is seen there.
+    """
+    cylinder = known.cylinder
+    share = min(AHEAD, FARTHEST / cylinder.length)
+    further = share * cylinder.length * cylinder.axis
+    ends = np.kron([[1.0 + share, -share], [-share, 1.0 + share]], np.eye(2))
+    reach = SURELY * np.sqrt(np.diag(ends @ known.covariance[:4, :4] @ ends.T))
+    gain = float(np.median(known.samples.gain))
+    if reach.max() * gain < TOLERANCE:
+        return None
+    longer = Cylinder(cylinder.start - further, cylinder.end + further, cylinder.radius)
+    ahead = replace(known.scene, cylinder=longer)
+    samples = ahead.samples().thinned(MOST_SAMPLES)
+    if not len(samples):
+        return None
+    furthest = reach.max() * float(samples.gain.max())
+    profiles = ahead.wide_profiles(samples, furthest)
+    steps = best_steps(samples, profiles, np.append(reach, RADIUS_HELD))
+    turned = adjusted(ahead.moved(steps[0]), held, np.zeros(5))
+    if turned is None:
+        return None
+    half = 0.5 * cylinder.length * turned.cylinder.axis
+    middle = turned.cylinder.middle
+    return replace(known.scene, cylinder=Cylinder(middle - half, middle + half, cylinder.radius))
+
+
+def extended(scene: Scene) -> Cylinder:
+    """The scene's cylinder, as long as its contour is seen; the same one where nothing is to be added.
 
     Where something hides the pipe there is no evidence against it.
     """
+    cylinder = scene.cylinder
     ahead = min(AHEAD * cylinder.length, FARTHEST)
     ends = []
     for at_end in (False, True):
-        evidence = axial_evidence(cylinder, at_end, ahead, scene)
+        evidence = axial_evidence(scene, at_end, ahead)
         further = 0.0 if evidence is None else _further(evidence, max(CLAMP_RADII * cylinder.radius, CLAMP))
         ends.append(cylinder.end + further * cylinder.axis if at_end else cylinder.start - further * cylinder.axis)
     return Cylinder(ends[0], ends[1], cylinder.radius)
 
 
-def axial_evidence(cylinder: Cylinder, at_end: bool, ahead: float, scene: Scene) -> AxialEvidence | None:
+def axial_evidence(scene: Scene, at_end: bool, ahead: float) -> AxialEvidence | None:
     """The evidence of the contour up to `ahead` [m] beyond an end; None where the pipe does not stand out.
 
     The pipe's contour shows edges as often as on the known half next to that end; what is no pipe shows them as often
     as the lines beside it.
     """
+    cylinder = scene.cylinder
     axis, end = (cylinder.axis, cylinder.end) if at_end else (-cylinder.axis, cylinder.start)
     back = min(0.5 * cylinder.length, 0.5 * FARTHEST)
     scene = scene.turned_to(cylinder)
 
-    def profile(aside: float, inner: float, limit: int) -> tuple[SupportProfile | None, float]:
+    def profile(aside: float, inner: float, limit: int) -> SupportProfile:
         shift = aside * scene.basis[0]
         stretch = Cylinder(end - inner * axis + shift, end + ahead * axis + shift, cylinder.radius)
-        samples, edges = scene.edges(stretch, TOLERANCE, SPACING, limit)
-        if not len(samples):
-            return None, 0.0
-        return support_profile(samples, hits(samples, edges, scene.view_offset)), float(np.median(samples.gain))
+        return replace(scene, cylinder=stretch).support(TOLERANCE, SPACING, limit)
 
-    on, gain = profile(0.0, back, SAMPLES)
-    if on is None:
-        return None
+    on = profile(0.0, back, SAMPLES)
     along = on.along + 0.5 * (ahead - back)
     known = along < 0
     if on.seen[known].sum() < MIN_SAMPLES:
         return None
-    aside = 2.0 * cylinder.radius + BESIDE / gain
-    beside = [profile(sign * aside, 0.0, SAMPLES_BESIDE)[0] for sign in (-1.0, 1.0)]
-    log_odds = _log_odds(on, known, [each for each in beside if each is not None])
+    aside = 2.0 * cylinder.radius + BESIDE / on.gain
+    beside = [profile(sign * aside, 0.0, SAMPLES_BESIDE) for sign in (-1.0, 1.0)]
+    log_odds = _log_odds(on, known, beside)
     return None if log_odds is None else AxialEvidence(along, log_odds, on.seen.sum(axis=1))
 
 

@@ -10,8 +10,7 @@ from scipy.stats import qmc
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
-from pipeprog_detect.silhouette.limb_edges import WINDOW_OF_HALF_WIDTH
-from pipeprog_detect.silhouette.scene import SPACING, Scene
+from pipeprog_detect.silhouette.limb_edges import WINDOW_OF_HALF_WIDTH, Profiles
 
 # Samples that the search scores; more only take longer.
 MOST_SAMPLES = 1500
@@ -27,33 +26,29 @@ CROWD, CELL = 16, 2.0
 
 
 def best_steps(
-    scene: Scene,
-    samples: ContourSamples,
-    reach: FloatArray,
-    furthest: float,
-    seeds: FloatArray | None = None,
+    samples: ContourSamples, profiles: Profiles, reach: FloatArray, seeds: FloatArray | None = None
 ) -> FloatArray:
     """Steps (E, 5) of `Scene.moved` within +-`reach` (5,) [m] that most edges of all views support, best first.
 
     Args:
-        samples: of the contour before the step (`MOST_SAMPLES` suffice), which moves them by `furthest` [px] at most.
+        samples: of the contour before the step; `MOST_SAMPLES` suffice.
+        profiles: the light around them, as far as the steps move them.
+        reach: range of each component of the step.
         seeds: further steps (S, 5) that are tried.
     """
-    furthest = min(float(samples.half_width.max()) * WINDOW_OF_HALF_WIDTH, furthest)
-    spacing = float(np.clip(np.median(samples.half_width) / 16.0, 0.25, 1.0))
-    offsets = np.arange(-np.ceil(furthest / spacing) - 2, np.ceil(furthest / spacing) + 3) * spacing
-    response = _responses(scene.light(samples, offsets, SPACING // 2), offsets, samples)
+    response = _responses(profiles, samples)
     none = np.zeros((0, 5))
-    return _annealed(samples, response, offsets, reach, none if seeds is None else seeds)
+    return _annealed(samples, response, profiles.offsets, reach, none if seeds is None else seeds)
 
 
-def _responses(values: NDArray[np.floating], offsets: FloatArray, samples: ContourSamples) -> NDArray[np.float32]:
-    """Peaks of the gradient along profiles `values` (N, Q): (N, Q) float32, 0 where none, up to 1 for a clear one.
+def _responses(profiles: Profiles, samples: ContourSamples) -> NDArray[np.float32]:
+    """Peaks of the gradient along profiles (N, Q): (N, Q) float32, 0 where none, up to 1 for a clear one.
 
     Strength saturates at the median of all peaks: a shadow's edge ten times stronger than the contour's counts about
     the same, and agreement over the views decides between them.
     """
-    slope = np.abs(gaussian_filter1d(np.asarray(values, float), 0.7 / (offsets[1] - offsets[0]), axis=1, order=1))
+    values, offsets = np.asarray(profiles.light, float), profiles.offsets
+    slope = np.abs(gaussian_filter1d(values, 0.7 / (offsets[1] - offsets[0]), axis=1, order=1))
     inner = slope[:, 1:-1]
     peak = (inner >= slope[:, :-2]) & (inner > slope[:, 2:])
     peak &= np.abs(offsets[None, 1:-1]) <= WINDOW_OF_HALF_WIDTH * samples.half_width[:, None]

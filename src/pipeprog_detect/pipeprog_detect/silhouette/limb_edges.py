@@ -35,6 +35,14 @@ LINEAR_LIGHT = _linear_light()
 
 
 @dataclass(frozen=True)
+class Profiles:
+    """Light across the contour at N samples: `light` (N, Q), 0 to 255, at `offsets` (Q,) outwards [px]."""
+
+    offsets: FloatArray
+    light: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
 class LimbEdges:
     """Up to M edges along each of N profiles, the best first.
 
@@ -48,7 +56,7 @@ class LimbEdges:
     sigma: FloatArray
     explained: FloatArray
 
-    def shifted(self, by: FloatArray) -> LimbEdges:
+    def displaced(self, by: FloatArray) -> LimbEdges:
         """The edges with all offsets of a profile moved by its value (N,) [px]."""
         return replace(self, offset=self.offset + by[:, None])
 

@@ -7,14 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.scene import Scene
-from pipeprog_detect.types import Cylinder
 
 # An edge of texture agrees with a contour by chance in two views.
 MIN_VIEWS = 3
-# Samples of one side that are fewer than this share of the other's are gaps between the cylinders that hide it.
-GAPS = 0.1
 
 
 @dataclass(frozen=True)
@@ -28,18 +24,12 @@ class SeenArc:
     sigma: float
 
 
-def only_visible_side(cylinder: Cylinder, scene: Scene) -> float | None:
+def only_visible_side(scene: Scene) -> float | None:
     """-1 or 1, along the scene's `basis[0]`: the side of the only visible contour line; None where there are two."""
-    samples = scene.samples(cylinder)
-    if shows_both_sides(samples) or len(np.unique(samples.view)) < MIN_VIEWS:
+    samples = scene.samples()
+    if samples.shows_both_sides() or len(np.unique(samples.view)) < MIN_VIEWS:
         return None
     return float(np.sign(samples.jacobian[:, 0].sum()))
-
-
-def shows_both_sides(samples: ContourSamples) -> bool:
-    """Whether visible samples lie on both sides, more of them than gaps in what hides one let through."""
-    count = np.bincount(samples.side, minlength=2)
-    return bool(count.min() > GAPS * count.max())
 
 
 def arc_precision(seen: SeenArc, side: float) -> FloatArray:

@@ -56,7 +56,19 @@ class End:
     odds: float
 
 
-def find_end(cylinder: Cylinder, at_end: bool, scene: Scene, surface_end: float | None) -> End | None:
+def find_ends(scene: Scene, surface: Cylinder | None) -> tuple[End | None, End | None]:
+    """What the images tell of the cylinder's start and end; None where they tell nothing.
+
+    `surface`: a cylinder on its axis, between whose ends the cloud shows the pipe, or None.
+    """
+    if surface is None:
+        return find_end(scene, False, None), find_end(scene, True, None)
+    whole = scene.cylinder
+    before, after = float((surface.start - whole.start) @ whole.axis), float((whole.end - surface.end) @ whole.axis)
+    return find_end(scene, False, -max(before, 0.0)), find_end(scene, True, -max(after, 0.0))
+
+
+def find_end(scene: Scene, at_end: bool, surface_end: float | None) -> End | None:
     """The end of the straight barrel near the given one, or None where the images do not tell.
 
     The end is where the evidence of the contour for the pipe is complete and where, on the barrel unrolled from each
@@ -64,11 +76,12 @@ def find_end(cylinder: Cylinder, at_end: bool, scene: Scene, surface_end: float 
     circle of the rim needs no conic that way: its projection is the unrolling itself. `surface_end` [m], outwards from
     the given end, is where the surface seen in the cloud ends, if it shows the pipe.
     """
+    cylinder = scene.cylinder
     outside = max(OUTSIDE, OUTSIDE_RADII * cylinder.radius)
     inside = min(outside, MOST_INSIDE * cylinder.length)
     if surface_end is not None:
         inside = min(inside, FATTENED + float(np.sqrt(6.0 * cylinder.radius * THICKNESS)) - surface_end)
-    evidence = axial_evidence(cylinder, at_end, outside, scene)
+    evidence = axial_evidence(scene, at_end, outside)
     if evidence is None:
         return None
     position, odds = _odds(evidence, inside)

@@ -1,4 +1,4 @@
-"""A scene: the views of one cylinder and what may hide it; samples its apparent contour and finds limb edges there."""
+"""A scene: a cylinder, its views and what may hide it; samples its apparent contour and finds limb edges there."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import (
     ContourSamples,
     contour_samples,
-    frame,
-    moved,
-    viewing_direction,
 )
+from pipeprog_detect.silhouette.edge_support import SupportProfile, hits, support_profile
 from pipeprog_detect.silhouette.limb_edges import (
     INWARD,
     LINEAR_LIGHT,
     WINDOW_OF_HALF_WIDTH,
     LimbEdges,
+    Profiles,
     limb_cost,
     limb_edges,
     smooth_cost,
@@ -43,20 +42,27 @@ BLUR_REACH, BLUR_SAMPLES = 0.8, 600
 CLEAR, LEAST_CLEAR, LEAST_LINES = 0.4, 4, 3
 # Surfaces only soften an edge: of all lines' blurs the lowest tenth is that of the images.
 SHARPEST = 0.1
+# On a thin pipe edges count within this share of its half-width, and at least within a blur of the contour [px].
+THIN_REACH, LEAST_REACH = 0.3, 0.6
+# Distance from the predicted contour within which its support is counted [px].
+SUPPORT_REACH = 1.5
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The views of one cylinder, what may hide it, and what is known of the views.
+    """A cylinder in its views, what may hide it, and what is known of the views.
 
     Attributes:
+        cylinder: as it is known so far.
         views: V keyframes.
         others: further cylinders, which may hide this one.
-        basis: (2, 3) unit vectors across the cylinder's axis: sideways as the views see it, and away from them.
+        basis: (2, 3) unit vectors across the axis, of which a step is made: sideways as the views see it, and away from
+            them.
         view_offset: (V,) shift of the whole pipe in each view towards side 0, which an error of its pose makes [px].
         blur: of the images [px].
     """
 
+    cylinder: Cylinder
     views: Sequence[View]
     others: Sequence[Cylinder]
     basis: FloatArray
@@ -66,35 +72,45 @@ class Scene:
     @classmethod
     def of(cls, cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> Scene:
         """The scene of a cylinder before its contour is measured: sharp views with true poses."""
-        return cls(views, others, frame(cylinder, viewing_direction(cylinder, views)), np.zeros(len(views)))
+        return cls(cylinder, views, others, frame(cylinder, viewing_direction(cylinder, views)), np.zeros(len(views)))
 
     def turned_to(self, cylinder: Cylinder) -> Scene:
-        """The scene with the basis of another cylinder."""
-        return replace(self, basis=frame(cylinder, viewing_direction(cylinder, self.views)))
+        """The scene of another cylinder, with its basis."""
+        return replace(self, cylinder=cylinder, basis=frame(cylinder, viewing_direction(cylinder, self.views)))
 
-    def shifted(self, view_offset: FloatArray) -> Scene:
-        """The scene with other offsets (V,) of its views [px]."""
-        return replace(self, view_offset=view_offset)
+    def moved(self, step: FloatArray) -> Scene:
+        """The scene of the cylinder after a step (5,): offsets of its start and end along the basis, and of its radius.
 
-    def moved(self, cylinder: Cylinder, step: FloatArray) -> Cylinder:
-        """The cylinder after a step (5,) along the basis; see `apparent_contour.moved`."""
-        return moved(cylinder, self.basis, step)
+        All in metres, as the columns of the samples' Jacobian.
+        """
+        start, end = self.cylinder.start + step[0:2] @ self.basis, self.cylinder.end + step[2:4] @ self.basis
+        return replace(self, cylinder=Cylinder(start, end, float(self.cylinder.radius + step[4])))
 
-    def samples(self, cylinder: Cylinder, spacing: int = SPACING, margin: float = 4.0) -> ContourSamples:
+    def within(self, reach: float) -> float:
+        """`reach` [px], but less on a thin pipe, whose two contour lines and highlight lie within some pixels."""
+        distance = [np.linalg.norm(view.centre - self.cylinder.middle) for view in self.views]
+        radius = self.cylinder.radius
+        half_width = [view.camera.fx * radius / each for view, each in zip(self.views, distance, strict=True)]
+        return float(min(reach, max(THIN_REACH * np.median(half_width), LEAST_REACH)))
+
+    def samples(self, spacing: int = SPACING, margin: float = 4.0) -> ContourSamples:
         """Samples of the cylinder's contour, about `spacing` [px] apart, that nothing hides."""
-        samples = contour_samples(cylinder, self.views, self.basis, spacing, margin)
-        return samples.select(visible(samples, cylinder, self.views, self.others))
+        samples = contour_samples(self.cylinder, self.views, self.basis, spacing, margin)
+        return samples.select(visible(samples, self.cylinder, self.views, self.others))
 
-    def edges(
-        self, cylinder: Cylinder, reach: float, spacing: int = SPACING, limit: int | None = None
-    ) -> tuple[ContourSamples, LimbEdges]:
+    def edges(self, reach: float, spacing: int = SPACING, limit: int | None = None) -> tuple[ContourSamples, LimbEdges]:
         """Visible samples, about `limit` at the most, and the limb edges within `reach` [px] of them.
 
         The edges' offsets are from the predicted contour; they are sought about where the views' offsets put it.
         """
-        samples, offsets, values = self._profiles(cylinder, reach, spacing, limit)
+        samples, offsets, values = self._profiles(reach, spacing, limit)
         edges = limb_edges(values, offsets, samples.half_width, self.blur, reach)
-        return samples, edges.shifted(self.shift_of(samples))
+        return samples, edges.displaced(self.shift_of(samples))
+
+    def support(self, reach: float = SUPPORT_REACH, spacing: int = SPACING, limit: int | None = None) -> SupportProfile:
+        """Support of the contour by the edges within `reach` [px] of it."""
+        samples, edges = self.edges(reach, spacing, limit)
+        return support_profile(samples, hits(edges, self.shift_of(samples)))
 
     def shift_of(self, samples: ContourSamples) -> FloatArray:
         """Outward displacement (N,) [px] of samples by their views' offsets."""
@@ -112,11 +128,18 @@ class Scene:
                 result[chosen] = _light(view, samples.pixel[chosen], samples.normal[chosen], offsets, lines)
         return result
 
-    def with_measured_blur(self, cylinder: Cylinder) -> Scene:
-        """The scene with the blur by which the limb model explains the cylinder's contour best."""
-        samples, offsets, values = replace(self, blur=1.0)._profiles(cylinder, BLUR_REACH, SPACING, BLUR_SAMPLES)
+    def wide_profiles(self, samples: ContourSamples, furthest: float) -> Profiles:
+        """The light at samples up to `furthest` [px] from them, as far as it belongs to one side of the pipe."""
+        furthest = min(float(samples.half_width.max()) * WINDOW_OF_HALF_WIDTH, furthest)
+        spacing = float(np.clip(np.median(samples.half_width) / 16.0, 0.25, 1.0))
+        offsets = np.arange(-np.ceil(furthest / spacing) - 2, np.ceil(furthest / spacing) + 3) * spacing
+        return Profiles(offsets, self.light(samples, offsets, SPACING // 2))
+
+    def measured_blur(self) -> float:
+        """The blur [px] by which the limb model explains the contour best; a sharp image's where it is not seen."""
+        samples, offsets, values = replace(self, blur=1.0)._profiles(BLUR_REACH, SPACING, BLUR_SAMPLES)
         if not len(samples):
-            return replace(self, blur=SHARP)
+            return SHARP
         trials = np.arange(-BLUR_REACH, BLUR_REACH + 0.1, 0.2, dtype=float)
         left = [limb_cost(values, offsets, samples.half_width, float(blur), trials).min(axis=1) for blur in BLURS]
         cost = np.log(np.stack(left) / smooth_cost(values, offsets, samples.half_width) + 1e-4)
@@ -127,14 +150,11 @@ class Scene:
             members = clear & (line == one)
             if members.sum() >= LEAST_CLEAR:
                 best.append(_lowest(np.log(BLURS), cost[:, members].sum(axis=1)))
-        blur = float(np.exp(np.quantile(best, SHARPEST))) if len(best) >= LEAST_LINES else SHARP
-        return replace(self, blur=blur)
+        return float(np.exp(np.quantile(best, SHARPEST))) if len(best) >= LEAST_LINES else SHARP
 
-    def _profiles(
-        self, cylinder: Cylinder, reach: float, spacing: int, limit: int | None
-    ) -> tuple[ContourSamples, FloatArray, FloatArray]:
+    def _profiles(self, reach: float, spacing: int, limit: int | None) -> tuple[ContourSamples, FloatArray, FloatArray]:
         """Visible samples, offsets (Q,) [px] and light (N, Q) there, from where the views' offsets put the contour."""
-        samples = self.samples(cylinder, spacing, margin=INWARD)
+        samples = self.samples(spacing, margin=INWARD)
         if limit is not None:
             samples = samples.thinned(limit)
         inward = INWARD
@@ -145,6 +165,25 @@ class Scene:
         pixel = samples.pixel + self.shift_of(samples)[:, None] * samples.normal
         values = self.light(replace(samples, pixel=pixel), offsets, spacing)
         return samples, offsets, np.asarray(values, float)
+
+
+def frame(cylinder: Cylinder, towards: FloatArray) -> FloatArray:
+    """Two unit vectors (2, 3) across the axis: sideways as seen along `towards`, and away from the viewer."""
+    axis = cylinder.axis
+    depth = towards - axis * (axis @ towards)
+    norm = float(np.linalg.norm(depth))
+    if norm < 1e-6:
+        depth = np.eye(3)[np.argmin(np.abs(axis))]
+        depth = depth - axis * (axis @ depth)
+        norm = float(np.linalg.norm(depth))
+    depth = depth / norm
+    return np.stack([np.cross(axis, depth), depth])
+
+
+def viewing_direction(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
+    """Mean unit vector (3,) from the cameras to the cylinder's middle."""
+    directions = [cylinder.middle - view.centre for view in views]
+    return np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
 
 
 def _light(view: View, pixel: FloatArray, normal: FloatArray, offsets: FloatArray, lines: int) -> NDArray[np.float32]:

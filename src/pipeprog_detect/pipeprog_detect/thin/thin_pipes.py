@@ -12,9 +12,9 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
-from pipeprog_detect.silhouette.apparent_contour import viewing_direction
-from pipeprog_detect.silhouette.contour_refinement import ContourFit, Start, refine
-from pipeprog_detect.silhouette.edge_support import contour_support
+from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.depth_from_cloud import covers, laid, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.types import Cylinder, View
@@ -120,7 +120,7 @@ class _LineFitter:
             return None
         if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq):
             return None
-        if contour_support(fit.cylinder, self.views, known).weaker_share < 0.5 * LINES_CONVINCING:
+        if Scene.of(fit.cylinder, self.views, known).support().weaker_share < 0.5 * LINES_CONVINCING:
             return None
         return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
 

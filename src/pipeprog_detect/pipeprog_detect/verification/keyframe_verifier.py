@@ -9,7 +9,8 @@ import numpy as np
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.apparent_contour import views_showing
-from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, contour_support
+from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
@@ -47,7 +48,8 @@ class KeyframeVerifier:
         if any(_resembles(cylinder, refused) for refused in self._refused):
             return False
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
-        fit = self._fitter.near_planned(self._fitter.fit(candidate, [], views, follow=False), [], self._views)
+        fit = self._fitter.fit(candidate, [], views, follow=False)
+        fit = self._fitter.near_planned(fit, [], self._views)
         if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
             self._refused.append(cylinder)
             return False
@@ -99,7 +101,7 @@ class KeyframeVerifier:
         """Whether the keyframes alone make a pipe of it: no stub, both sides seen (a board or a step shows one)."""
         if is_stub(cylinder):
             return False
-        return contour_support(cylinder, self._views, others).weaker_share >= MIN_SUPPORT
+        return Scene.of(cylinder, self._views, others).support().weaker_share >= MIN_SUPPORT
 
 
 def _resembles(one: Cylinder, other: Cylinder) -> bool:

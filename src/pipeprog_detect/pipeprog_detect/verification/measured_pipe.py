@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.cloud.collinear import join, spanning
-from pipeprog_detect.silhouette.contour_refinement import ContourFit
-from pipeprog_detect.types import Cylinder
+from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
+from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.types import Cylinder, View
 
 # What the cloud does not resolve is no pipe if it is shorter than this many radii: hangers and clamps are.
 SLENDER = 20.0
@@ -65,3 +68,17 @@ def is_stub(cylinder: Cylinder) -> bool:
 def is_known(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
     """Whether the middle of the cylinder lies within a known one."""
     return any(other.contains(cylinder.middle) for other in known)
+
+
+def own_contours(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArray[np.bool_]:
+    """Mask (N,) of the cylinders whose contours are their own once all of them are known.
+
+    A cylinder that was measured before the one that hides it was found may have been fitted to that one's edges:
+    without them its support falls below `MIN_SUPPORT`. One that never had that support is not judged by it.
+    """
+    kept = np.ones(len(cylinders), bool)
+    for number, cylinder in enumerate(cylinders):
+        others = [other for k, other in enumerate(cylinders) if k != number and kept[k]]
+        if Scene.of(cylinder, views, others).support().share < MIN_SUPPORT:
+            kept[number] = Scene.of(cylinder, views, []).support().share < MIN_SUPPORT
+    return kept

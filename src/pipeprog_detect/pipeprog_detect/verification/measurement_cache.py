@@ -11,7 +11,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.collinear import near
 from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.silhouette.apparent_contour import in_image
-from pipeprog_detect.silhouette.contour_refinement import ContourFit
+from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cylinder, View
 
 # A candidate is the same while its ends move by less than the cloud's own scatter [m] and a share of its radius, and

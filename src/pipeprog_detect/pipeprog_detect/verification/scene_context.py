@@ -11,7 +11,7 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
-from pipeprog_detect.silhouette.apparent_contour import frame
+from pipeprog_detect.silhouette.scene import frame
 from pipeprog_detect.types import Cylinder
 
 # Mean cosine between the normals of a pipe and those of its points: noise turns a thin pipe's by less than 60 deg.

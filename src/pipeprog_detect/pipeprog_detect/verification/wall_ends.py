@@ -107,7 +107,7 @@ def _goes_on(
     total: FloatArray = np.zeros(1)
     place: FloatArray = np.zeros(1)
     if looking:
-        evidence = axial_evidence(cylinder, at_end, ahead, Scene.of(cylinder, looking, others))
+        evidence = axial_evidence(Scene.of(cylinder, looking, others), at_end, ahead)
         if evidence is None:
             return False
         beyond = (evidence.along > 0.0) & (evidence.along < ahead)

@@ -11,14 +11,12 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.silhouette.apparent_contour import (
     contour_samples,
-    frame,
-    moved,
     project,
     tangent_normals,
-    viewing_direction,
     views_showing,
 )
 from pipeprog_detect.silhouette.occlusion import visible
+from pipeprog_detect.silhouette.scene import Scene, frame, viewing_direction
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.straight_ahead import looking_along_y
 
@@ -79,7 +77,7 @@ def test_jacobian_is_the_derivative(tilt: float, parameter: int, radius: float) 
     at = contour_samples(cylinder, [view], basis, 50.0)
     step = np.zeros(5)
     step[parameter] = 1e-6
-    shifted = contour_lines(moved(cylinder, basis, step), view)
+    shifted = contour_lines(Scene.of(cylinder, [view], []).moved(step).cylinder, view)
     for index in range(len(at)):
         segment = shifted[at.side[index]]
         normal = np.array([-(segment[1] - segment[0])[1], (segment[1] - segment[0])[0]])

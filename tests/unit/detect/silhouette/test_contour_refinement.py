@@ -7,9 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.apparent_contour import frame
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.edge_support import contour_support
+from pipeprog_detect.silhouette.scene import Scene, frame
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
@@ -91,9 +90,9 @@ def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
 
 def test_support_tells_a_pipe_from_a_guess(pipe_views: list[View], empty_views: list[View]) -> None:
     thick = Cylinder(PIPE.start, PIPE.end, 1.2 * PIPE.radius)
-    assert contour_support(PIPE, pipe_views, []).share > 0.9
-    assert contour_support(thick, pipe_views, []).share < 0.2
-    assert contour_support(PIPE, empty_views, []).share < 0.2
+    assert Scene.of(PIPE, pipe_views, []).support().share > 0.9
+    assert Scene.of(thick, pipe_views, []).support().share < 0.2
+    assert Scene.of(PIPE, empty_views, []).support().share < 0.2
 
 
 def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:

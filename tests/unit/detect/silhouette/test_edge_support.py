@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, SupportProfile, contour_support, own_contours
+from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT, SupportProfile
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.measured_pipe import own_contours
 from tests.unit.detect.pipe_and_wall import PIPE
 
 BEHIND = 0.012  # [m]
@@ -23,7 +25,7 @@ def ghost_of(pipe: Cylinder, views: list[View]) -> Cylinder:
 def test_a_ghost_behind_a_pipe_has_no_outlines_of_its_own(pipe_views: list[View]) -> None:
     views = pipe_views[2:6]
     ghost = ghost_of(PIPE, views)
-    assert contour_support(ghost, views, []).share > MIN_SUPPORT
+    assert Scene.of(ghost, views, []).support().share > MIN_SUPPORT
     assert own_contours([ghost, PIPE], views).tolist() == [False, True]
     assert own_contours([PIPE, ghost], views).tolist() == [True, False]
 
@@ -31,17 +33,17 @@ def test_a_ghost_behind_a_pipe_has_no_outlines_of_its_own(pipe_views: list[View]
 def test_a_pipe_alone_keeps_its_outlines_and_what_never_had_any_is_not_judged_by_them(pipe_views: list[View]) -> None:
     aside = np.array([0.2, 0.0, 0.0])
     nothing = Cylinder(PIPE.start + aside, PIPE.end + aside, PIPE.radius)
-    assert contour_support(nothing, pipe_views, []).share < MIN_SUPPORT
+    assert Scene.of(nothing, pipe_views, []).support().share < MIN_SUPPORT
     assert own_contours([PIPE, nothing], pipe_views).tolist() == [True, True]
 
 
 def test_an_edge_that_is_one_outline_of_a_cylinder_is_not_both(pipe_views: list[View]) -> None:
     aside = np.array([1.5 * PIPE.radius, 0.0, 0.0])
     beside = Cylinder(PIPE.start + aside, PIPE.end + aside, 0.5 * PIPE.radius)
-    seen = contour_support(beside, pipe_views, [])
+    seen = Scene.of(beside, pipe_views, []).support()
     assert seen.share > 2.0 * MIN_SUPPORT
     assert seen.weaker_share < MIN_SUPPORT
-    assert contour_support(PIPE, pipe_views, []).weaker_share > 0.8
+    assert Scene.of(PIPE, pipe_views, []).support().weaker_share > 0.8
 
 
 @pytest.mark.parametrize("views", [3, 4, 5, 8, 20])

@@ -48,7 +48,7 @@ def test_a_piece_too_short_to_tell_its_direction_grows_in_the_one_that_its_edges
 
 def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[View], empty_views: list[View]) -> None:
     for views in (pipe_views, empty_views):
-        same = extended(PIPE, Scene.of(PIPE, views, []))
+        same = extended(Scene.of(PIPE, views, []))
         assert same.length == pytest.approx(PIPE.length, abs=1e-9)
 
 
@@ -58,13 +58,13 @@ def test_what_hides_a_pipe_does_not_end_it(pipe_views: list[View]) -> None:
     crossing = PIPE.start + 0.24 * PIPE.axis + np.array([0.0, -0.15, 0.0])
     rod = Cylinder(crossing - np.array([0.4, 0.0, 0.0]), crossing + np.array([0.4, 0.0, 0.0]), 0.03)
     scene = Scene.of(known, pipe_views, [rod])
-    twice = extended(extended(known, scene), scene)
+    twice = extended(replace(scene, cylinder=extended(scene)))
     assert (twice.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=SAMPLES_TOLERANCE)
 
 
 def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
     short = Cylinder(PIPE.start, PIPE.end - 0.1 * PIPE.axis, PIPE.radius)
-    evidence = axial_evidence(short, True, 0.25, Scene.of(short, pipe_views, []))
+    evidence = axial_evidence(Scene.of(short, pipe_views, []), True, 0.25)
     assert evidence is not None
     step = evidence.along[1] - evidence.along[0]
     assert evidence.log_odds[(evidence.along > 0) & (evidence.along < 0.1 - step)].min() > 0
@@ -72,4 +72,4 @@ def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
 
 
 def test_no_evidence_without_a_pipe(empty_views: list[View]) -> None:
-    assert axial_evidence(PIPE, True, 0.2, Scene.of(PIPE, empty_views, [])) is None
+    assert axial_evidence(Scene.of(PIPE, empty_views, []), True, 0.2) is None

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.apparent_contour import frame, moved, viewing_direction
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.one_sided import SeenArc, arc_precision, only_visible_side
-from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.silhouette.scene import Scene, frame, viewing_direction
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
@@ -21,8 +20,8 @@ def side_of_the_neighbour(views: list[View]) -> float:
 
 
 def test_the_outline_away_from_the_neighbour_is_the_only_one(pipe_views: list[View]) -> None:
-    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [NEIGHBOUR])) == -side_of_the_neighbour(pipe_views)
-    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [])) is None
+    assert only_visible_side(Scene.of(PIPE, pipe_views, [NEIGHBOUR])) == -side_of_the_neighbour(pipe_views)
+    assert only_visible_side(Scene.of(PIPE, pipe_views, [])) is None
 
 
 def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View]) -> None:
@@ -31,18 +30,17 @@ def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View])
         return Cylinder(NEIGHBOUR.start, NEIGHBOUR.start + share * (NEIGHBOUR.end - NEIGHBOUR.start), NEIGHBOUR.radius)
 
     nearly_all, half = up_to(0.065), up_to(-0.1)
-    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [nearly_all])) == -side_of_the_neighbour(pipe_views)
+    assert only_visible_side(Scene.of(PIPE, pipe_views, [nearly_all])) == -side_of_the_neighbour(pipe_views)
     assert refine(Start(PIPE, SEEN.sigma), pipe_views, [nearly_all], follow=False) is None
-    assert only_visible_side(PIPE, Scene.of(PIPE, pipe_views, [half])) is None
+    assert only_visible_side(Scene.of(PIPE, pipe_views, [half])) is None
 
 
 def test_one_outline_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
     """A radius 4 mm too large whose surface lies where it was seen; to the cloud that is 1.6 sigma."""
-    basis = frame(PIPE, viewing_direction(PIPE, pipe_views))
     half = 0.5 * SEEN.arc
     middle = np.array([-side_of_the_neighbour(pipe_views) * np.cos(half), -np.sin(half)])
     step = np.concatenate([-0.004 * middle, -0.004 * middle, [0.004]])
-    start = moved(PIPE, basis, step)
+    start = Scene.of(PIPE, pipe_views, []).moved(step).cylinder
     assert refine(Start(start, SEEN.sigma), pipe_views, [NEIGHBOUR], follow=False) is None
     fit = refine(Start(start, SEEN.sigma, seen=SEEN), pipe_views, [NEIGHBOUR], follow=False)
     assert fit is not None

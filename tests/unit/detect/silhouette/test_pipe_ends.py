@@ -21,7 +21,7 @@ def test_rim_is_found(pipe_views: list[View], at_end: bool, error: float) -> Non
     start = PIPE.start - (0.0 if at_end else error) * axis
     end = PIPE.end + (error if at_end else 0.0) * axis
     given = Cylinder(start, end, PIPE.radius)
-    found = find_end(given, at_end, Scene.of(given, pipe_views, []), None)
+    found = find_end(Scene.of(given, pipe_views, []), at_end, None)
     assert found is not None
     assert found.position == pytest.approx(-error, abs=END_TOLERANCE)
     assert abs(found.position + error) < 3.0 * found.sigma < 0.01
@@ -29,18 +29,18 @@ def test_rim_is_found(pipe_views: list[View], at_end: bool, error: float) -> Non
 
 def test_no_end_where_the_pipe_goes_on_or_leaves_the_images(pipe_views: list[View]) -> None:
     inner = Cylinder(PIPE.start, PIPE.start + 0.02 * PIPE.axis, PIPE.radius)
-    assert find_end(inner, True, Scene.of(inner, pipe_views, []), None) is None
+    assert find_end(Scene.of(inner, pipe_views, []), True, None) is None
     beyond = Cylinder(PIPE.start, PIPE.end + 1.0 * PIPE.axis, PIPE.radius)
-    assert find_end(beyond, True, Scene.of(beyond, pipe_views, []), None) is None
+    assert find_end(Scene.of(beyond, pipe_views, []), True, None) is None
 
 
 def test_surface_of_the_cloud_is_not_cut_off(pipe_views: list[View]) -> None:
     longer = Cylinder(PIPE.start, PIPE.end + 0.1 * PIPE.axis, PIPE.radius)
-    found = find_end(longer, True, Scene.of(longer, pipe_views, []), 0.0)
+    found = find_end(Scene.of(longer, pipe_views, []), True, 0.0)
     assert found is not None
     # The cloud may go on over the end by half a stereo window and into a bend by the surface's thickness, no farther.
     assert -(FATTENED + np.sqrt(6.0 * PIPE.radius * THICKNESS)) < found.position < 0.0
-    grown = find_end(longer, True, Scene.of(longer, pipe_views, []), -0.1)
+    grown = find_end(Scene.of(longer, pipe_views, []), True, -0.1)
     assert grown is not None
     assert grown.position == pytest.approx(-0.1, abs=END_TOLERANCE)
 
@@ -49,12 +49,12 @@ def test_the_edge_of_what_hides_a_pipe_is_not_its_end(pipe_views: list[View]) ->
     """A thicker pipe crosses before the end; only what is seen of the barrel is told."""
     across = PIPE.end + np.array([0.0, -0.2, 0.0])
     hides = Cylinder(across - np.array([0.5, 0.0, 0.0]), across + np.array([0.5, 0.0, 0.0]), 0.06)
-    found = find_end(PIPE, True, Scene.of(PIPE, pipe_views, [hides]), 0.0)
+    found = find_end(Scene.of(PIPE, pipe_views, [hides]), True, 0.0)
     assert found is not None
     assert found.position == pytest.approx(0.0, abs=END_TOLERANCE)
 
 
 def test_a_rim_speaks_for_an_end(pipe_views: list[View]) -> None:
-    found = find_end(PIPE, True, Scene.of(PIPE, pipe_views, []), None)
+    found = find_end(Scene.of(PIPE, pipe_views, []), True, None)
     assert found is not None
     assert found.odds > 1.0
