@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import theilslopes
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import in_image
@@ -106,9 +107,10 @@ def by_bin(cell: NDArray[np.int64], depth: NDArray[np.float32], bins: int, perce
 
 def robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     """Slope and value at 0 of the line through points (N,), by the median of the slopes of all pairs (Theil, Sen)."""
-    dx = x[:, None] - x
-    slope = float(np.median(((y[:, None] - y)[dx > 0]) / dx[dx > 0])) if len(x) > 1 else 0.0
-    return slope, float(np.median(y - slope * x))
+    if len(x) < 2:
+        return 0.0, float(y[0])
+    slope, level, *_ = theilslopes(y, x, method="joint")
+    return float(slope), float(level)
 
 
 def _sight(cylinder: Cylinder, centre: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -32,8 +32,8 @@ class SegmentPairs:
     def __len__(self) -> int:
         return len(self.ends)
 
-    def select(self, keep: NDArray[np.bool_]) -> SegmentPairs:
-        """Those that a mask (N,) names."""
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> SegmentPairs:
+        """Those that a mask or an index array names."""
         return SegmentPairs(self.ends[keep], self.width[keep])
 
 

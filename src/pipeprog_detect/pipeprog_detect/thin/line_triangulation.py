@@ -39,8 +39,8 @@ OVERLAP = 0.3
 DEPTH_SIGMA = 1.0
 # Lines that pass so many radii beside each other are the same: a highlight or a shadow lies a radius off an outline.
 SAME_LINE = 0.5
-# Hypotheses that are followed into all views.
-MOST_HYPOTHESES = 4000
+# Hypotheses that are followed into all views (a computing budget), and rounds of least squares on what matches.
+MOST_HYPOTHESES, ROUNDS = 4000, 2
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,9 @@ class _Axes:
         return _Axes(self.ends[keep], self.radius[keep], self.sigma[keep])
 
 
+_NO_AXES = _Axes(np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
+
+
 def propose(
     views: Sequence[View],
     points: NDArray[np.float32],
@@ -93,29 +96,43 @@ def propose(
     """
     edges = {} if edges is None else edges
     seen = (_pair_view(view, points, radii, known, edges) for view in _apart(views, points))
-    sights = [sight for sight in seen if sight is not None]
-    parts = [_at_cloud_depth(sight, radius) for sight in sights for radius in radii]
+    pair_views = [each for each in seen if each is not None]
+    axes = _hypotheses(pair_views, radii)
+    for _ in range(ROUNDS):
+        axes = _adjusted(axes, pair_views)
+    found, centres = _best_seen(axes, pair_views, limit)
+    if not found:
+        return []
+    found = [laid(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)]
+    radius = np.array([one.radius for one in found])
+    axes = _adjusted(_Axes(np.stack([[one.start, one.end] for one in found]), radius, DEPTH_SIGMA * radius), pair_views)
+    return [Cylinder(ends[0], ends[1], float(radius)) for ends, radius in zip(axes.ends, axes.radius, strict=True)]
+
+
+def _hypotheses(pair_views: Sequence[_PairView], radii: Sequence[float]) -> _Axes:
+    """Axes from the cloud's depth at single segment pairs, and from pairs of pairs; evenly thinned."""
+    parts = [_NO_AXES]
+    parts += [_at_cloud_depth(pair_view, radius) for pair_view in pair_views for radius in radii]
     parts += [
-        _triangulated(sight, other, radius)
-        for number, sight in enumerate(sights)
-        for other in sights[number + 1 : number + 1 + PARTNERS]
+        _triangulated(pair_view, other, radius)
+        for number, pair_view in enumerate(pair_views)
+        for other in pair_views[number + 1 : number + 1 + PARTNERS]
         for radius in radii
     ]
-    parts = [part for part in parts if len(part.radius)]
-    if not parts:
-        return []
     columns = zip(*([one.ends, one.radius, one.sigma] for one in parts), strict=True)
     axes = _Axes(*(np.concatenate(column) for column in columns))
-    axes = axes.select(np.arange(0, len(axes.radius), -(-len(axes.radius) // MOST_HYPOTHESES)))
-    for _ in range(2):
-        matched = [_matches(axes, sight) for sight in sights]
-        axes = _adjusted(axes, sights, matched)
-    matched = [_matches(axes, sight) for sight in sights]
-    sees = np.stack([_in_view(axes, sight) for sight in sights])
-    seen = sees.sum(axis=0)
-    count = np.sum([pair >= 0 for pair in matched], axis=0)
+    return axes.select(np.arange(0, len(axes.radius), max(-(-len(axes.radius) // MOST_HYPOTHESES), 1)))
+
+
+def _best_seen(axes: _Axes, pair_views: Sequence[_PairView], limit: int) -> tuple[list[Cylinder], list[FloatArray]]:
+    """Up to `limit` cylinders that most views show, the same line once, and the mean centres (3,) of these views."""
     found: list[Cylinder] = []
     centres: list[FloatArray] = []
+    if not len(axes.radius):
+        return found, centres
+    sees = np.stack([_in_view(axes, pair_view) for pair_view in pair_views])
+    seen = sees.sum(axis=0)
+    count = np.sum([_matches(axes, pair_view) >= 0 for pair_view in pair_views], axis=0)
     for best in np.argsort(-count, kind="stable"):
         if count[best] < max(MIN_VIEWS, MIN_SHARE * seen[best]):
             break
@@ -125,14 +142,8 @@ def propose(
             found[covering[0]] = extended_to(found[covering[0]], cylinder, centres[covering[0]])
         elif len(found) < limit:
             found.append(cylinder)
-            centres.append(np.mean([sights[k].view.centre for k in np.flatnonzero(sees[:, best])], axis=0))
-    if not found:
-        return []
-    found = [laid(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)]
-    radius = np.array([one.radius for one in found])
-    axes = _Axes(np.stack([[one.start, one.end] for one in found]), radius, DEPTH_SIGMA * radius)
-    axes = _adjusted(axes, sights, [_matches(axes, sight) for sight in sights])
-    return [Cylinder(ends[0], ends[1], float(radius)) for ends, radius in zip(axes.ends, axes.radius, strict=True)]
+            centres.append(np.mean([pair_views[k].view.centre for k in np.flatnonzero(sees[:, best])], axis=0))
+    return found, centres
 
 
 def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
@@ -226,13 +237,13 @@ def _cloud_depths(
     return before, flat
 
 
-def _at_cloud_depth(sight: _PairView, radius: float) -> _Axes:
+def _at_cloud_depth(pair_view: _PairView, radius: float) -> _Axes:
     """Axes of segment pairs that stand out from the cloud and are as wide as a pipe of `radius` [m] would be there."""
-    depth = sight.before + 0.5 * radius
-    width = 2.0 * sight.view.camera.fx * radius / depth
-    fits = np.isfinite(depth).all(axis=1) & (np.abs(width - sight.pairs.width).max(axis=1) < 2.5 * WIDTH_SIGMA)
-    in_camera = _rays(sight)[fits] * depth[fits][..., None]
-    pose = np.linalg.inv(sight.view.camera_from_map)
+    depth = pair_view.before + 0.5 * radius
+    width = 2.0 * pair_view.view.camera.fx * radius / depth
+    fits = np.isfinite(depth).all(axis=1) & (np.abs(width - pair_view.pairs.width).max(axis=1) < 2.5 * WIDTH_SIGMA)
+    in_camera = _rays(pair_view)[fits] * depth[fits][..., None]
+    pose = np.linalg.inv(pair_view.view.camera_from_map)
     count = len(in_camera)
     return _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(count, radius), np.full(count, DEPTH_SIGMA * radius))
 
@@ -265,10 +276,10 @@ def _within_silhouette(found: SegmentPairs, cylinder: Cylinder, view: View) -> N
     return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
 
 
-def _rays(sight: _PairView) -> FloatArray:
+def _rays(pair_view: _PairView) -> FloatArray:
     """Directions (N, 2, 3) with unit depth, in the camera's frame, of the segment pairs' ends."""
-    camera = sight.view.camera
-    ends = sight.pairs.ends
+    camera = pair_view.view.camera
+    ends = pair_view.pairs.ends
     x = (ends[..., 0] - camera.cx) / camera.fx
     y = (ends[..., 1] - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -281,33 +292,32 @@ def _centre_lines(found: SegmentPairs) -> FloatArray:
     return np.concatenate([normal, -np.einsum("ij,ij->i", normal, found.ends[:, 0])[:, None]], axis=1)
 
 
-def _without_depth(sight: _PairView) -> _PairView:
+def _without_depth(pair_view: _PairView) -> _PairView:
     """The view with those segment pairs alone that the cloud does not show."""
-    return replace(sight, pairs=sight.pairs.select(np.asarray(np.isnan(sight.before).any(axis=1), bool)))
+    return replace(pair_view, pairs=pair_view.pairs.select(np.asarray(np.isnan(pair_view.before).any(axis=1), bool)))
 
 
-def _triangulated(sight: _PairView, other: _PairView, radius: float) -> _Axes:
+def _triangulated(pair_view: _PairView, other: _PairView, radius: float) -> _Axes:
     """Axes that a segment pair of one view and one of another make with a radius [m].
 
     The inverse depth of each end of the first follows by linear least squares from both widths and from the distance
     of the projected end from the other centre line.
     """
-    none = _Axes(np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
-    if not len(sight.pairs) or not len(other.pairs):
-        return none
-    sight, other = _without_depth(sight), _without_depth(other)  # what the cloud shows needs no second view
-    if not len(sight.pairs) or not len(other.pairs):
-        return none
-    focal, rays = sight.view.camera.fx, _rays(sight)
-    other_from_sight = other.view.camera_from_map @ np.linalg.inv(sight.view.camera_from_map)
+    if not len(pair_view.pairs) or not len(other.pairs):
+        return _NO_AXES
+    pair_view, other = _without_depth(pair_view), _without_depth(other)  # what the cloud shows needs no second view
+    if not len(pair_view.pairs) or not len(other.pairs):
+        return _NO_AXES
+    focal, rays = pair_view.view.camera.fx, _rays(pair_view)
+    other_from_first = other.view.camera_from_map @ np.linalg.inv(pair_view.view.camera_from_map)
     matrix = other.view.camera.matrix
-    still = rays @ (matrix @ other_from_sight[:3, :3]).T
-    shift = matrix @ other_from_sight[:3, 3]
-    width = sight.pairs.width
+    still = rays @ (matrix @ other_from_first[:3, :3]).T
+    shift = matrix @ other_from_first[:3, 3]
+    width = pair_view.pairs.width
     first = width / (2.0 * focal * radius)
     depth = still[..., 2] + first * shift[2]
     if not (depth > 0.1).any():
-        return none
+        return _NO_AXES
     depth = np.maximum(depth, 0.1)
     line = _centre_lines(other.pairs)
     slope = (line @ shift)[None, None] / (depth[..., None] * CENTRE_SIGMA)
@@ -320,21 +330,21 @@ def _triangulated(sight: _PairView, other: _PairView, radius: float) -> _Axes:
     left = (
         (slope * inverse - level) ** 2 + (gauge * inverse - own[..., None]) ** 2 + (gauge_there * inverse - there) ** 2
     )
-    near, far = sight.depth
+    near, far = pair_view.depth
     good = ((left < WORST) & (inverse > 1.0 / far) & (inverse < 1.0 / near)).all(axis=1)
     one, two = np.nonzero(good)
     if not len(one):
-        return none
+        return _NO_AXES
     in_camera = rays[one] / inverse[one, :, two][..., None]
-    pose = np.linalg.inv(sight.view.camera_from_map)
+    pose = np.linalg.inv(pair_view.view.camera_from_map)
     axes = _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(len(one), radius), np.full(len(one), LAID_REACH))
     ends, _ = _projected(axes, other)
     return axes.select(_overlap(ends, other.pairs.ends[two]) > OVERLAP)
 
 
-def _projected(axes: _Axes, sight: _PairView) -> tuple[FloatArray, FloatArray]:
+def _projected(axes: _Axes, pair_view: _PairView) -> tuple[FloatArray, FloatArray]:
     """Pixels (H, 2, 2) and depths (H, 2) of the axes' ends."""
-    pixel, depth = project(sight.view, axes.ends.reshape(-1, 3))
+    pixel, depth = project(pair_view.view, axes.ends.reshape(-1, 3))
     return pixel.reshape(-1, 2, 2), depth.reshape(-1, 2)
 
 
@@ -349,83 +359,56 @@ def _overlap(ends: FloatArray, others: FloatArray) -> FloatArray:
     return np.asarray((high - low) / (shorter + 1e-9))
 
 
-def _in_view(axes: _Axes, sight: _PairView) -> NDArray[np.bool_]:
+def _in_view(axes: _Axes, pair_view: _PairView) -> NDArray[np.bool_]:
     """Which axes (H,) have their middle inside the view."""
-    return in_image(sight.view, axes.ends.mean(axis=1))
+    return in_image(pair_view.view, axes.ends.mean(axis=1))
 
 
-def _matches(axes: _Axes, sight: _PairView) -> NDArray[np.int64]:
+def _matches(axes: _Axes, pair_view: _PairView) -> NDArray[np.int64]:
     """Index (H,) of the segment pair of the view that fits each axis best, -1 where none does."""
     none = np.full(len(axes.radius), -1)
-    if not len(sight.pairs):
+    if not len(pair_view.pairs):
         return none
-    ends, depth = _projected(axes, sight)
+    ends, depth = _projected(axes, pair_view)
     front = (depth > 0.05).all(axis=1)
     along = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(along, axis=1) + 1e-9
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None]
-    offset = sight.pairs.ends[None] - ends[:, None, :1]
+    offset = pair_view.pairs.ends[None] - ends[:, None, :1]
     aside = np.einsum("hqek,hk->hqe", offset, normal)
     place = np.einsum("hqek,hk->hqe", offset, along) / (length**2)[:, None, None]
     inverse = 1.0 / depth[:, 0, None, None] + np.clip(place, 0.0, 1.0) * np.diff(1.0 / depth, axis=1)[:, None]
-    width = 2.0 * sight.view.camera.fx * axes.radius[:, None, None] * inverse
-    left = (aside / (2.0 * CENTRE_SIGMA)) ** 2 + ((width - sight.pairs.width[None]) / WIDTH_SIGMA) ** 2
+    width = 2.0 * pair_view.view.camera.fx * axes.radius[:, None, None] * inverse
+    left = (aside / (2.0 * CENTRE_SIGMA)) ** 2 + ((width - pair_view.pairs.width[None]) / WIDTH_SIGMA) ** 2
     worst: FloatArray = left.max(axis=2)
-    common = _overlap(np.broadcast_to(ends[:, None], offset.shape), np.broadcast_to(sight.pairs.ends, offset.shape))
+    common = _overlap(np.broadcast_to(ends[:, None], offset.shape), np.broadcast_to(pair_view.pairs.ends, offset.shape))
     worst = np.where(np.asarray(front)[:, None] & (common > OVERLAP), worst, np.inf)
     best = np.argmin(worst, axis=1)
     return np.where(worst[np.arange(len(best)), best] < WORST, best, none)
 
 
-def _adjusted(axes: _Axes, sights: Sequence[_PairView], matched: Sequence[NDArray[np.int64]]) -> _Axes:
+def _adjusted(axes: _Axes, pair_views: Sequence[_PairView]) -> _Axes:
     """The axes after a least-squares step on the segment pairs that match, and as long as what these show.
 
-    Each end moves across the axis by (2,); the segment pairs' centre lines and widths, at both of the pair's ends, are
-    the observations; the depth that a hypothesis came with is the prior.
+    Each end moves across the axis by (2,); the pairs' centre lines and widths, at both of their ends, are the
+    observations; the depth that a hypothesis came with is the prior.
     """
     count = len(axes.radius)
-    along = axes.ends[:, 1] - axes.ends[:, 0]
-    length = np.linalg.norm(along, axis=1)
-    along = along / length[:, None]
-    middle = axes.ends.mean(axis=1)
-    weight = np.stack([_in_view(axes, sight) for sight in sights]).astype(float) + 1e-6
-    towards = middle - weight.T @ np.stack([sight.view.centre for sight in sights]) / weight.sum(axis=0)[:, None]
-    depth = towards - along * np.einsum("ij,ij->i", along, towards)[:, None]
-    depth = depth / (np.linalg.norm(depth, axis=1)[:, None] + 1e-12)
-    basis = np.stack([np.cross(along, depth), depth], axis=1)
-    normal = np.eye(4) / axes.sigma[:, None, None] ** 2
-    right = np.zeros((count, 4))
+    if not count:
+        return axes
+    basis = _basis(axes, pair_views)
+    equations = _NormalEquations(np.eye(4) / axes.sigma[:, None, None] ** 2, np.zeros((count, 4)))
     low: FloatArray = np.full(count, np.inf)
     high: FloatArray = np.full(count, -np.inf)
-    for sight, pair in zip(sights, matched, strict=True):
+    for pair_view in pair_views:
+        pair = _matches(axes, pair_view)
         rows = np.flatnonzero(pair >= 0)
-        if not len(rows):
-            continue
-        chosen, camera = pair[rows], sight.view.camera
-        line = _centre_lines(sight.pairs)[chosen]
-        rotation = sight.view.camera_from_map[:3, :3]
-        pixel, far = _projected(axes.select(rows), sight)
-        image_along = pixel[:, 1] - pixel[:, 0]
-        square = (image_along**2).sum(axis=1)
-        for end in (0, 1):
-            # Where the pair's end falls on the axis: perspective makes the share of the length of that in the image.
-            share = np.einsum("ij,ij->i", sight.pairs.ends[chosen, end] - pixel[:, 0], image_along) / square
-            share = share * far[:, 0] / (far[:, 1] + share * (far[:, 0] - far[:, 1]))
-            share = np.clip(share, -0.5, 1.5)
-            low[rows] = np.minimum(low[rows], share)
-            high[rows] = np.maximum(high[rows], share)
-            point = axes.ends[rows, 0] + (share * length[rows])[:, None] * along[rows]
-            seen, distance = project(sight.view, point)
-            sideways = line[:, :2] @ np.diag([camera.fx, camera.fy])
-            ray = np.stack([(seen[:, 0] - camera.cx) / camera.fx, (seen[:, 1] - camera.cy) / camera.fy], axis=1)
-            gradient = np.concatenate([sideways, -(sideways * ray).sum(axis=1)[:, None]], axis=1) / distance[:, None]
-            moves = np.einsum("ik,kl,ijl->ij", gradient, rotation, basis[rows])
-            residual = -(np.einsum("ij,ij->i", line[:, :2], seen) + line[:, 2])
-            _accumulate(normal, right, rows, share, moves, residual, CENTRE_SIGMA)
-            width = 2.0 * camera.fx * axes.radius[rows] / distance
-            moves = -(width / distance)[:, None] * np.einsum("l,ijl->ij", rotation[2], basis[rows])
-            _accumulate(normal, right, rows, share, moves, sight.pairs.width[chosen, end] - width, WIDTH_SIGMA)
-    step = np.linalg.solve(normal, right[..., None])[..., 0].reshape(count, 2, 2)
+        if len(rows):
+            pairs = pair_view.pairs.select(pair[rows])
+            for share in _observe(axes.select(rows), basis[rows], replace(pair_view, pairs=pairs), equations, rows):
+                low[rows] = np.minimum(low[rows], share)
+                high[rows] = np.maximum(high[rows], share)
+    step = np.linalg.solve(equations.normal, equations.right[..., None])[..., 0].reshape(count, 2, 2)
     shown = low < high
     low, high = np.where(shown, low, 0.0).astype(float), np.where(shown, high, 1.0).astype(float)
     ends = axes.ends + np.einsum("hej,hjk->hek", step, basis)
@@ -434,16 +417,63 @@ def _adjusted(axes: _Axes, sights: Sequence[_PairView], matched: Sequence[NDArra
     return replace(axes, ends=ends)
 
 
-def _accumulate(
-    normal: FloatArray,
-    right: FloatArray,
-    rows: NDArray[np.int64],
-    share: FloatArray,
-    moves: FloatArray,
-    residual: FloatArray,
-    sigma: float,
-) -> None:
-    """Adds observations of the points at `share` of the axes `rows` to the normal equations."""
-    gradient = np.concatenate([(1.0 - share)[:, None] * moves, share[:, None] * moves], axis=1) / sigma
-    normal[rows] += gradient[:, :, None] * gradient[:, None]
-    right[rows] += gradient * (residual / sigma)[:, None]
+def _basis(axes: _Axes, pair_views: Sequence[_PairView]) -> FloatArray:
+    """Two unit vectors (H, 2, 3) across each axis: sideways as the views that show it see it, and away from them."""
+    along = axes.ends[:, 1] - axes.ends[:, 0]
+    along = along / np.linalg.norm(along, axis=1)[:, None]
+    weight = np.stack([_in_view(axes, pair_view) for pair_view in pair_views]).astype(float) + 1e-6
+    centres = np.stack([pair_view.view.centre for pair_view in pair_views])
+    towards = axes.ends.mean(axis=1) - weight.T @ centres / weight.sum(axis=0)[:, None]
+    depth = towards - along * np.einsum("ij,ij->i", along, towards)[:, None]
+    depth = depth / (np.linalg.norm(depth, axis=1)[:, None] + 1e-12)
+    return np.stack([np.cross(along, depth), depth], axis=1)
+
+
+def _observe(
+    axes: _Axes, basis: FloatArray, seen: _PairView, equations: _NormalEquations, rows: NDArray[np.int64]
+) -> list[FloatArray]:
+    """Adds what a view's pairs, one for each of the axes, tell of these to the equations `rows`.
+
+    Returns where, as a share of each axis' length, its pair's two ends lie.
+    """
+    length = np.linalg.norm(axes.ends[:, 1] - axes.ends[:, 0], axis=1)
+    along = (axes.ends[:, 1] - axes.ends[:, 0]) / length[:, None]
+    line, camera, rotation = _centre_lines(seen.pairs), seen.view.camera, seen.view.camera_from_map[:3, :3]
+    pixel, far = _projected(axes, seen)
+    image_along = pixel[:, 1] - pixel[:, 0]
+    square = (image_along**2).sum(axis=1)
+    shares = []
+    for end in (0, 1):
+        # Where the pair's end falls on the axis: perspective makes the share of the length of that in the image.
+        share = np.einsum("ij,ij->i", seen.pairs.ends[:, end] - pixel[:, 0], image_along) / square
+        share = share * far[:, 0] / (far[:, 1] + share * (far[:, 0] - far[:, 1]))
+        share = np.clip(share, -0.5, 1.5)
+        at, distance = project(seen.view, axes.ends[:, 0] + (share * length)[:, None] * along)
+        sideways = line[:, :2] @ np.diag([camera.fx, camera.fy])
+        ray = np.stack([(at[:, 0] - camera.cx) / camera.fx, (at[:, 1] - camera.cy) / camera.fy], axis=1)
+        gradient = np.concatenate([sideways, -(sideways * ray).sum(axis=1)[:, None]], axis=1) / distance[:, None]
+        moves = np.einsum("ik,kl,ijl->ij", gradient, rotation, basis) / CENTRE_SIGMA
+        residual = -(np.einsum("ij,ij->i", line[:, :2], at) + line[:, 2]) / CENTRE_SIGMA
+        equations.add(rows, share, moves, residual)
+        width = 2.0 * camera.fx * axes.radius / distance
+        moves = -(width / distance)[:, None] * np.einsum("l,ijl->ij", rotation[2], basis) / WIDTH_SIGMA
+        equations.add(rows, share, moves, (seen.pairs.width[:, end] - width) / WIDTH_SIGMA)
+        shares.append(share)
+    return shares
+
+
+@dataclass(frozen=True)
+class _NormalEquations:
+    """Normal equations of H axes: `normal` (H, 4, 4) and `right` (H, 4), for the moves of both ends across the axis."""
+
+    normal: FloatArray
+    right: FloatArray
+
+    def add(self, rows: NDArray[np.int64], share: FloatArray, moves: FloatArray, residual: FloatArray) -> None:
+        """Adds an observation of the point at `share` (K,) of each axis in `rows` (K,).
+
+        `moves` (K, 2): derivative by a move of the point across the axis, and `residual` (K,), both over sigma.
+        """
+        gradient = np.concatenate([(1.0 - share)[:, None] * moves, share[:, None] * moves], axis=1)
+        self.normal[rows] += gradient[:, :, None] * gradient[:, None]
+        self.right[rows] += gradient * residual[:, None]
