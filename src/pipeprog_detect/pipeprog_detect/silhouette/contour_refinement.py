@@ -25,7 +25,7 @@ KNOWN_RADIUS, KNOWN_AXIS = 0.02, 0.5
 AXIS_RANGE, RADIUS_RANGE = (3.0, 2.0, 0.4), (2.5, 2.0, 0.3)
 # The distance from the cameras is sought within two of its standard deviations.
 DEPTH_RANGE = 2.0
-# Results of the search compete on sub-pixel edges where their contours differ by this much [px rms]; at most so many.
+# Up to three results of the search compete on sub-pixel edges, if their contours differ by this much [px rms].
 APART, CANDIDATES = 0.8, 3
 
 

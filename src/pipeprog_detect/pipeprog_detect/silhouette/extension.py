@@ -43,7 +43,7 @@ TOLERANCE = 1.5
 RADIUS_HELD = 1e-4
 # Standard deviations within which what is known of a direction is sought.
 SURELY = 3.0
-# A pipe of which a piece is known is extended so many times at most, each time up to its own length at either end.
+# Extensions of a piece, each by up to its own length at either end: to 3^6 times its length at the most.
 MAX_EXTENSIONS = 6
 # An extension is rejected (radius and axis stay those known before) if support drops below this share of its former
 # value, if the radius changes by more than this many standard deviations, ...

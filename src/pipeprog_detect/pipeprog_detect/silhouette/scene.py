@@ -30,15 +30,15 @@ from pipeprog_detect.types import Cylinder, View
 
 # Length of contour [px] that makes one measurement: the mean over it averages texture, the line stays straight within.
 SPACING = 12
-# Outside the pipe the limb model's window ends where the next thing may begin: this far [px], and so many blurs.
+# The limb model's window outside the pipe, where the next thing may begin: this width [px], and three blurs.
 OUTWARD, OUTWARD_OF_BLUR = 1.5, 3.0
 # Blur of a sharp image, lens and pixel together, and the ones that are tried [px].
 SHARP = 0.5
 BLURS = np.array([0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.5])
 # The blur is measured within this distance of the predicted contour [px], on about this many samples.
 BLUR_REACH, BLUR_SAMPLES = 0.8, 600
-# A sample shows a clear edge where the limb model leaves less than this share of what a smooth profile leaves; so many
-# such samples measure one line's blur, and so many lines the images'.
+# A sample shows a clear edge where the limb model leaves less than this share of what a smooth profile leaves. At least
+# four such samples measure the blur of one line (a view's one side), and three lines that of the images.
 CLEAR, LEAST_CLEAR, LEAST_LINES = 0.4, 4, 3
 # Surfaces only soften an edge: of all lines' blurs the lowest tenth is that of the images.
 SHARPEST = 0.1

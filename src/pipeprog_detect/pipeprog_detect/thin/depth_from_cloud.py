@@ -12,13 +12,14 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import in_image
 from pipeprog_detect.types import Cylinder, View
 
-# The cloud beside a thin pipe is looked at as far as so many of its widths.
-RELIEF_REACH = 4.0
-# The cloud is looked for so far before and behind a proposed axis [m].
-LAID_REACH = 0.3
-# Behind a thin pipe the cloud shows more of the wall than of it: so many percent of the points there are its own.
+# Width of the strip of cloud beside a thin pipe that it is compared with, in its own widths.
+BESIDE_REACH = 4.0
+# Distance before and behind a proposed axis in which the cloud counts [m].
+DEPTH_REACH = 0.3
+# Along the lines of sight to a thin pipe the cloud shows more of the wall than of it: this percentile of the depths is
+# still its own.
 FRONT = 10.0
-# Stereo draws a thin pipe to the wall, never to the camera: of the places along it so many show how near it is.
+# Stereo draws a thin pipe to the wall, never to the camera: the nearest quarter of the positions tells its depth.
 FOREMOST = 0.25
 
 
@@ -31,7 +32,7 @@ def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
 def covers(one: Cylinder, other: Cylinder, centre: FloatArray, radii: float) -> bool:
     """Whether two cylinders look, from `centre`, like pieces of one: their depths are what is known worst.
 
-    Their lines of sight may pass so many radii beside each other.
+    Their lines of sight may pass each other at up to `radii` radii of the first.
     """
     axis, towards, side = _sight(one, centre)
     ends = np.stack([other.start, other.end]) - centre
@@ -53,7 +54,9 @@ def extended_to(one: Cylinder, other: Cylinder, centre: FloatArray) -> Cylinder:
     return Cylinder(one.start + low * axis, one.start + high * axis, one.radius)
 
 
-def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, sloping: bool = True) -> Cylinder | None:
+def at_cloud_depth(
+    cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, sloping: bool = True
+) -> Cylinder | None:
     """The cylinder at the depth of the nearest points (N, 3) that it hides from `centre`; None where there are few.
 
     Where these lie no nearer than those beside it they are the wall's: the cloud does not show the pipe there. Unless
@@ -63,7 +66,7 @@ def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, sl
     depth = float((cylinder.start - centre) @ towards)
     offset = points - centre.astype(np.float32)
     far = offset @ towards.astype(np.float32)
-    near = np.abs(far - depth) < LAID_REACH
+    near = np.abs(far - depth) < DEPTH_REACH
     offset, far = offset[near], far[near]
     place = (offset @ axis.astype(np.float32)) * depth / far - float((cylinder.start - centre) @ axis)
     aside = (offset @ side.astype(np.float32)) * depth / far
@@ -74,7 +77,7 @@ def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, sl
     front = by_bin(cell[inner], far[inner], bins, FRONT)
     flanks = []
     for sign in (-1.0, 1.0):
-        beside = along & (sign * aside > 2.4 * cylinder.radius) & (sign * aside < 2.0 * RELIEF_REACH * cylinder.radius)
+        beside = along & (sign * aside > 2.4 * cylinder.radius) & (sign * aside < 2.0 * BESIDE_REACH * cylinder.radius)
         flanks.append(by_bin(cell[beside], far[beside], bins, FRONT))
     known = np.isfinite(front) & ~(np.fmax(*flanks) - front < cylinder.radius)
     if known.sum() < 0.3 * bins:
@@ -86,7 +89,7 @@ def laid(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, sl
         slope = float(1.0 / ((cylinder.end - centre) @ towards) - 1.0 / depth)
         level = float(np.quantile(inverse_front - slope * at, 1.0 - FOREMOST))
     inverse = np.array([level, level + slope])
-    if (np.abs(depth * inverse - 1.0) > LAID_REACH * inverse).any():
+    if (np.abs(depth * inverse - 1.0) > DEPTH_REACH * inverse).any():
         return None
     ends = []
     for end, share in ((cylinder.start, 0.0), (cylinder.end, 1.0)):

@@ -12,32 +12,33 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import in_image, project
 from pipeprog_detect.thin.depth_from_cloud import (
-    LAID_REACH,
-    RELIEF_REACH,
+    BESIDE_REACH,
+    DEPTH_REACH,
+    at_cloud_depth,
     by_bin,
     covers,
     extended_to,
-    laid,
     robust_line,
 )
 from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
 
-# Lines are sought in views that differ by so much of the distance to what they see, and in no more than so many.
+# Baseline from view to view, as a share of the median depth of what they see, and number of views at the most.
 STEP, MOST_VIEWS = 0.12, 120
-# Half of a thin pipe's width [px] that suffices to see its two outlines: larger images are reduced.
+# Half of a thin pipe's width [px] that suffices to see its two sides: larger images are reduced.
 ENOUGH = 4.5
-# Standard deviations of a segment pair's centre line and width [px], shading and shadows beside the pipe included, ...
+# Standard deviations of a segment pair's centre line and width [px], shading and shadows beside the pipe included.
 CENTRE_SIGMA, WIDTH_SIGMA = 1.0, 1.2
-# ... and what the worst accepted sum of their squares is: two degrees of freedom, one in a thousand.
+# Largest accepted sum of their squares: chi square of two degrees of freedom, exceeded once in a thousand times.
 WORST = 13.8
-# The next views that a segment pair is sought in first, and the views in all that must show a pipe.
+# Following views in which a segment pair is triangulated, least number of views that must show a pipe, and least share
+# of those in which its middle lies.
 PARTNERS, MIN_VIEWS, MIN_SHARE = 3, 4, 0.25
-# Common stretch of two segment pairs of one pipe, of the shorter one.
+# Least common length of two segment pairs of one pipe, as a share of the shorter one.
 OVERLAP = 0.3
 # Standard deviation of a hypothesis's depth, in radii of the pipe.
 DEPTH_SIGMA = 1.0
-# Lines that pass so many radii beside each other are the same: a highlight or a shadow lies a radius off an outline.
+# Lines that pass each other at less than this many radii are the same: highlights and shadows lie a radius off a side.
 SAME_LINE = 0.5
 # Hypotheses that are followed into all views (a computing budget), and rounds of least squares on what matches.
 MOST_HYPOTHESES, ROUNDS = 4000, 2
@@ -103,7 +104,9 @@ def propose(
     found, centres = _best_seen(axes, pair_views, limit)
     if not found:
         return []
-    found = [laid(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)]
+    found = [
+        at_cloud_depth(cylinder, points, centre) or cylinder for cylinder, centre in zip(found, centres, strict=True)
+    ]
     radius = np.array([one.radius for one in found])
     axes = _adjusted(_Axes(np.stack([[one.start, one.end] for one in found]), radius, DEPTH_SIGMA * radius), pair_views)
     return [Cylinder(ends[0], ends[1], float(radius)) for ends, radius in zip(axes.ends, axes.radius, strict=True)]
@@ -204,7 +207,7 @@ def _cloud_depths(
     flat = np.zeros(len(found), bool)
     for number in range(len(found)):
         ends, width = found.ends[number], float(found.width[number].mean())
-        reach = RELIEF_REACH * width
+        reach = BESIDE_REACH * width
         near = ((pixel > ends.min(axis=0) - reach) & (pixel < ends.max(axis=0) + reach)).all(axis=1)
         along = ends[1] - ends[0]
         length = float(np.linalg.norm(along))
@@ -337,7 +340,7 @@ def _triangulated(pair_view: _PairView, other: _PairView, radius: float) -> _Axe
         return _NO_AXES
     in_camera = rays[one] / inverse[one, :, two][..., None]
     pose = np.linalg.inv(pair_view.view.camera_from_map)
-    axes = _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(len(one), radius), np.full(len(one), LAID_REACH))
+    axes = _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(len(one), radius), np.full(len(one), DEPTH_REACH))
     ends, _ = _projected(axes, other)
     return axes.select(_overlap(ends, other.pairs.ends[two]) > OVERLAP)
 

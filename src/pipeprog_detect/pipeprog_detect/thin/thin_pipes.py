@@ -15,7 +15,7 @@ from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
-from pipeprog_detect.thin.depth_from_cloud import covers, laid, mean_centre
+from pipeprog_detect.thin.depth_from_cloud import at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
@@ -101,7 +101,7 @@ class _LineFitter:
         slope_known_to = float(np.sqrt(piece.covariance[3, 3]))
         start, slope_sigma = aligned(replace(piece.cylinder, radius=radius), known, self.views, slope_known_to)
         centre = mean_centre(start, self.views)
-        at_depth = None if centre is None else laid(start, self.points, centre, not np.isfinite(slope_sigma))
+        at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, not np.isfinite(slope_sigma))
         depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * radius
         return self.measure(at_depth or start, known, depth_sigma, slope_sigma)
 

@@ -17,7 +17,7 @@ from pipeprog_detect.verification.measurement_cache import MeasurementCache, Que
 # Support that makes a pipe: those that exist show edges along more than half of their visible contour.
 CONVINCING = 0.5
 # The windows in which edges are sought follow from the radius: where it changes by more than this share they are placed
-# anew, in so many rounds at most.
+# anew, twice at most.
 SETTLED, MAX_ROUNDS = 0.1, 3
 # A planned radius within this share of one that is not planned is tried, and taken with this share of its support.
 NEAR_PLANNED, AS_GOOD = 0.15, 0.6

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from pipeprog_detect.thin.depth_from_cloud import covers, laid, mean_centre
+from pipeprog_detect.thin.depth_from_cloud import at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.line_triangulation import SAME_LINE
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, WALL, front_points, wall_points
@@ -19,11 +19,11 @@ def test_a_thin_pipe_is_laid_at_the_depth_of_the_points_before_the_wall() -> Non
     sparse = front_points(thin)[::7]
     deep = np.array([0.0, 0.05, 0.0])
     proposed = Cylinder(centre + 1.05 * (thin.start - centre) + deep, centre + 1.05 * (thin.end - centre), thin.radius)
-    found = laid(proposed, np.concatenate([wall_points(), sparse]).astype(np.float32), centre)
+    found = at_cloud_depth(proposed, np.concatenate([wall_points(), sparse]).astype(np.float32), centre)
     assert found is not None
     for end, true in ((found.start, thin.start), (found.end, thin.end)):
         assert end[1] == pytest.approx(true[1], abs=thin.radius)
-    assert laid(proposed, np.zeros((0, 3), np.float32), centre) is None
+    assert at_cloud_depth(proposed, np.zeros((0, 3), np.float32), centre) is None
 
 
 def test_the_wall_beside_and_behind_a_pipe_does_not_lay_it() -> None:
@@ -35,11 +35,11 @@ def test_the_wall_beside_and_behind_a_pipe_does_not_lay_it() -> None:
     drawn = np.stack([rng.uniform(0.0, 0.3, 400), rng.uniform(0.0, WALL, 400), rng.uniform(-0.009, 0.009, 400)], axis=1)
     points = np.concatenate([wall_points(), near, drawn]).astype(np.float32)
     proposed = Cylinder(np.array([-0.31, 0.04, 0.0]), np.array([0.31, 0.04, 0.0]), thin.radius)
-    found = laid(proposed, points, centre, sloping=False)
+    found = at_cloud_depth(proposed, points, centre, sloping=False)
     assert found is not None
     assert found.start[1] == pytest.approx(thin.start[1], abs=thin.radius)
     assert found.end[1] == pytest.approx(thin.end[1], abs=thin.radius)
-    assert laid(proposed, wall_points().astype(np.float32), centre) is None
+    assert at_cloud_depth(proposed, wall_points().astype(np.float32), centre) is None
 
 
 def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:
