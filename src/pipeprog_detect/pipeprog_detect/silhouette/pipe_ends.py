@@ -25,8 +25,9 @@ HALF_ARC, SECTORS, RAYS_PER_SECTOR = np.radians(70.0), 6, 4
 SAMPLES_PER_PIXEL = 2
 # The end is sought this far beyond the given one [m, radii], and as far inside, at most this share of the length.
 OUTSIDE, OUTSIDE_RADII, MOST_INSIDE = 0.15, 3.0, 0.6
-# Positions less probable by the contour than the best one by more than this are left out, and an edge all around is
-# worth at most this (natural logarithms): the contour tells the position to some samples, the rim within them.
+# Positions less probable by the contour than the best one by more than this are left out (natural logarithm: one in
+# three thousand), and an edge all around the barrel is worth at most three times as much: the contour tells the
+# position to some samples, the rim within them.
 PLAUSIBLE, RIM_WORTH = 8.0, 25.0
 # Pixels beside what hides the barrel that are left out: its edge is none of the barrel's.
 BESIDE_HIDDEN = 4

@@ -21,7 +21,7 @@ from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 
 # Proposals that are measured, and points of the cloud that bound their depths: a computing budget. More proposals than
-# a site has thin pipes cost time only; the points are ten for each cell of a view's coarse depth image.
+# a site has thin pipes cost time only.
 MOST_PROPOSED, MOST_POINTS = 40, 600_000
 # Without support by the cloud, this support of the contour is required, and half of it on each side separately: the
 # edge of a duct, whose faces differ in brightness, is one side, with texture for the other.
