@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
+from pipeprog_detect.config import ContourConfig, DetectConfig
+from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
-from tests.unit.detect.pipe_and_wall import PIPE
+from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
 from tests.unit.detect.straight_ahead import looking_along_y
 
 BOQ = BillOfQuantities((PipeClass("DN65", PIPE.radius, 3.0, (0.0, 0.0, 1.0), 4e-4),))
@@ -23,3 +25,14 @@ def test_a_pipe_that_few_keyframes_of_many_show_is_vouched_for(pipe_views: list[
     candidate = Candidate(rough, 0.002, 900, evidence)
     assert KeyframeVerifier(views, BOQ).verify(candidate)
     assert not KeyframeVerifier(elsewhere, BOQ).verify(candidate)
+
+
+def test_the_keyframes_measure_a_pipe_unless_contours_are_disabled(pipe_views: list[View]) -> None:
+    points = np.concatenate([wall_points(), front_points(PIPE)])
+    points = points + np.random.default_rng(3).normal(0.0, 1e-3, points.shape)
+    disabled = DetectConfig(contour=ContourConfig(enabled=False))
+    cloud_alone = detect(Cloud(points), BOQ, DetectConfig())
+    without, measured = (detect(Cloud(points), BOQ, config, pipe_views) for config in (disabled, DetectConfig()))
+    assert len(cloud_alone) == len(without) == len(measured) == 1
+    assert without[0].cylinder.radius == cloud_alone[0].cylinder.radius
+    assert measured[0].cylinder.radius != cloud_alone[0].cylinder.radius
