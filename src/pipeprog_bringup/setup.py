@@ -16,6 +16,7 @@ setup(
         (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # by which colcon test knows what to run
     zip_safe=False,
     maintainer="pipeprog developers",
     maintainer_email="maintainers@pipeprog.dev",

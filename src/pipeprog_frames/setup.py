@@ -11,6 +11,7 @@ setup(
         (f"share/{package_name}", ["package.xml"]),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # by which colcon test knows what to run
     zip_safe=False,
     maintainer="pipeprog developers",
     maintainer_email="maintainers@pipeprog.dev",
