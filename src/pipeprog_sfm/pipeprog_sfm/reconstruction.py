@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +22,7 @@ from pipeprog_sfm.dense.dense_mapper import DenseMapper, centre
 from pipeprog_sfm.dense.depth_fusion import FusedCloud
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import NoScaleError, ScaleEstimate
+from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
@@ -72,14 +73,20 @@ class MetricMap:
 
 
 class Reconstruction:
-    """Sparse poses, scale, depth maps and fusion over a stream of keyframes."""
+    """Sparse poses, scale, depth maps and fusion over a stream of keyframes.
 
-    def __init__(self, config: SfmConfig, board_file: BoardFile) -> None:
+    Args:
+        config: settings.
+        board_file: boards, scale bars and known distances that may be seen.
+        sources: what measures the scale; `(*SOURCES, own)` adds a source of one's own (examples/own_scale_source.py).
+    """
+
+    def __init__(self, config: SfmConfig, board_file: BoardFile, sources: Sequence[ScaleSource] = SOURCES) -> None:
         self._mapper = Mapper(config.mapper, config.seed)
         self._map = self._mapper.map
         self._config = config
         self._deblurrer = Deblurrer(config)
-        self._metric_tracker = MetricTracker(board_file, config.board, config.odometry)
+        self._metric_tracker = MetricTracker(board_file, config.board, config.odometry, sources)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
         self._pending: tuple[ScaleEstimate, Trajectory, Future[FusedCloud]] | None = None
