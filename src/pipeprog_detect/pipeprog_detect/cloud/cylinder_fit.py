@@ -63,7 +63,7 @@ def fit_cylinder(
     reach: float = 4.0,
     along_ray: bool = True,
 ) -> CylinderFit | None:
-    """Fit a cylinder to points (N, 3) [m] near `initial`; None where they hold none.
+    """Fit a cylinder to points (N, 3) [m] near `initial`; None where fewer than ten of them agree with one.
 
     Minimises the geometric distance (faithful 5-parameter form of Lukacs, Marshall and Martin) with Tukey weights at
     the known noise `sigma` [m], annealed from `reach` times the final width: with the scale of the residuals instead,
@@ -125,7 +125,7 @@ def covered_arc(points: FloatArray, cylinder: Cylinder, bins: int = 72) -> float
     if not len(breaks):
         return float(len(seen) * 2 * np.pi / bins)
     turned = np.roll(seen, -(breaks[0] + 1))
-    parts = np.split(turned, np.cumsum(np.roll(np.diff(np.append(breaks, breaks[0] + len(seen))), 0))[:-1])
+    parts = np.split(turned, np.cumsum(np.diff(np.append(breaks, breaks[0] + len(seen))))[:-1])
     return float(max(len(part) for part in parts) * 2 * np.pi / bins)
 
 
@@ -245,6 +245,83 @@ def _feet(
 
 
 @njit(cache=True, nogil=True)
+def _normal_equations(
+    points: FloatArray,
+    centre: FloatArray,
+    axis: FloatArray,
+    radius: float,
+    tensor: FloatArray,
+    cut: float,
+    lever: float,
+    metric: bool,
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Matrix (5, 5), upper triangle, and right side (5,) of a step of (centre u, v, axis u, v, radius).
+
+    Residuals beyond `cut` standard deviations have no weight; centre and axis turn about the point `lever` [m] along
+    the axis. Also returns the mean position of the weighted points along the axis [m], and their weight.
+    """
+    u, v = basis(axis)
+    muu, muv, mvv = u @ tensor @ u, u @ tensor @ v, v @ tensor @ v
+    typical, determinant = 0.5 * (muu + mvv), muu * mvv - muv * muv
+    matrix = np.zeros((5, 5))
+    right = np.zeros(5)
+    row = np.empty(5)
+    moment, total = 0.0, 0.0
+    for i in range(len(points)):
+        ox, oy, oz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = ox * u[0] + oy * u[1] + oz * u[2]
+        y = ox * v[0] + oy * v[1] + oz * v[2]
+        if metric:
+            x, y, d = _foot(x, y, radius, muu, muv, mvv)
+        else:
+            rho = np.sqrt(x * x + y * y) + 1e-12
+            d = rho - radius
+            x /= rho
+            y /= rho
+        variance = x * x * muu + 2.0 * x * y * muv + y * y * mvv
+        share = d * d / (variance * cut**2)
+        if share >= 1.0:
+            continue
+        z = ox * axis[0] + oy * axis[1] + oz * axis[2]
+        weight = (1.0 - share) ** 2 * typical / variance
+        moment += weight * z
+        total += weight
+        z -= lever
+        row[0], row[1], row[2], row[3], row[4] = -x, -y, -z * x, -z * y, -1.0
+        for a in range(5):
+            right[a] -= weight * d * row[a]
+            for b in range(a, 5):
+                matrix[a, b] += weight * row[a] * row[b]
+        if metric:
+            # Isotropic unit noise about a curve of curvature k lies k / 2 outside it; here in the tensor's metric.
+            bias = 0.5 * determinant / (radius * variance)
+            for a in range(5):
+                right[a] += _SLOPE * typical / variance * bias * row[a]
+    return matrix, right, moment, total
+
+
+@njit(cache=True, nogil=True)
+def _bounded_step(matrix: FloatArray, right: FloatArray, used: int, radius: float) -> tuple[FloatArray, float, float]:
+    """Step (5,) of the first `used` unknowns, kept within 0.3 rad, half a radius and 30 % of it; tilt, shift before."""
+    for a in range(used):
+        matrix[a, a] = matrix[a, a] * (1.0 + 1e-6) + 1e-9
+        for b in range(a):
+            matrix[a, b] = matrix[b, a]
+    step = np.zeros(5)
+    step[:used] = np.linalg.solve(matrix[:used, :used], right[:used])
+    tilt = np.sqrt(step[2] ** 2 + step[3] ** 2)
+    if tilt > 0.3:
+        step[2] *= 0.3 / tilt
+        step[3] *= 0.3 / tilt
+    shift = np.sqrt(step[0] ** 2 + step[1] ** 2)
+    if shift > 0.5 * radius:
+        step[0] *= 0.5 * radius / shift
+        step[1] *= 0.5 * radius / shift
+    step[4] = min(max(step[4], -0.3 * radius), 0.3 * radius)
+    return step, tilt, shift
+
+
+@njit(cache=True, nogil=True)
 def _iterate(
     points: FloatArray,
     centre: FloatArray,
@@ -255,68 +332,21 @@ def _iterate(
     free_radius: bool,
     metric: bool,
 ) -> tuple[bool, FloatArray, FloatArray, float]:
+    """Gauss-Newton from a start to (whether it found points, centre, axis, radius)."""
     centre, axis = centre.copy(), axis.copy()
-    count = len(points)
     used = 5 if free_radius else 4
-    row = np.empty(5)
     lever = 0.0
     precision = 1e-3 * np.sqrt(tensor[0, 0] + tensor[1, 1] + tensor[2, 2])
     for turn in range(_MOST_ROUNDS):
         wide = max(1.0, reach + (1.0 - reach) * turn / (_ANNEALING - 1.0))
-        u, v = basis(axis)
-        muu, muv, mvv = u @ tensor @ u, u @ tensor @ v, v @ tensor @ v
-        typical, determinant = 0.5 * (muu + mvv), muu * mvv - muv * muv
-        matrix = np.zeros((5, 5))
-        right = np.zeros(5)
-        moment, total = 0.0, 0.0
-        for i in range(count):
-            ox, oy, oz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-            x = ox * u[0] + oy * u[1] + oz * u[2]
-            y = ox * v[0] + oy * v[1] + oz * v[2]
-            if metric:
-                x, y, d = _foot(x, y, radius, muu, muv, mvv)
-            else:
-                rho = np.sqrt(x * x + y * y) + 1e-12
-                d = rho - radius
-                x /= rho
-                y /= rho
-            variance = x * x * muu + 2.0 * x * y * muv + y * y * mvv
-            share = d * d / (variance * (_CUT * wide) ** 2)
-            if share >= 1.0:
-                continue
-            z = ox * axis[0] + oy * axis[1] + oz * axis[2]
-            weight = (1.0 - share) ** 2 * typical / variance
-            moment += weight * z
-            total += weight
-            z -= lever
-            row[0], row[1], row[2], row[3], row[4] = -x, -y, -z * x, -z * y, -1.0
-            for a in range(used):
-                right[a] -= weight * d * row[a]
-                for b in range(a, used):
-                    matrix[a, b] += weight * row[a] * row[b]
-            if metric:
-                # Isotropic unit noise about a curve of curvature k lies k / 2 outside it; here in the tensor's metric.
-                bias = 0.5 * determinant / (radius * variance)
-                for a in range(used):
-                    right[a] += _SLOPE * typical / variance * bias * row[a]
+        matrix, right, moment, total = _normal_equations(
+            points, centre, axis, radius, tensor, _CUT * wide, lever, metric
+        )
         if total < 5.0:
             return False, centre, axis, radius
-        for a in range(used):
-            matrix[a, a] = matrix[a, a] * (1.0 + 1e-6) + 1e-9
-            for b in range(a):
-                matrix[a, b] = matrix[b, a]
-        step = np.zeros(5)
-        step[:used] = np.linalg.solve(matrix[:used, :used], right[:used])
-        tilt = np.sqrt(step[2] ** 2 + step[3] ** 2)
-        if tilt > 0.3:
-            step[2] *= 0.3 / tilt
-            step[3] *= 0.3 / tilt
-        shift = np.sqrt(step[0] ** 2 + step[1] ** 2)
-        if shift > 0.5 * radius:
-            step[0] *= 0.5 * radius / shift
-            step[1] *= 0.5 * radius / shift
-        step[4] = min(max(step[4], -0.3 * radius), 0.3 * radius)
+        step, tilt, shift = _bounded_step(matrix, right, used, radius)
         # Shift and tilt are taken about the mean of the points: elsewhere they are nearly the same unknown.
+        u, v = basis(axis)
         centre = centre + lever * axis + step[0] * u + step[1] * v
         lever = moment / total - lever
         axis = axis + step[2] * u + step[3] * v

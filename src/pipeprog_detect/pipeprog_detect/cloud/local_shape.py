@@ -14,6 +14,14 @@ from pipeprog_detect.cloud.octree import THREADS, Octree, neighbour_ranges
 
 # A quadric has six coefficients: twice as many points leave something to judge it by.
 _LEAST_POINTS = 12
+# Neighbours of a site that a quadric is fitted to: an even subset where there are more. Twice the 500 that a thinned
+# cloud of scale / 7 holds within a thick surface; the fit's variance falls no further, and its time is bounded.
+_MOST_NEIGHBOURS = 1024
+# Neighbours that spread across their plane by less than this share of the noise are flat: the noise alone spreads them
+# by 1, a curvature that matters by more; averaged cells scatter less than single points do.
+_FLAT = 0.7
+# A quadric that fewer of a patch's points agree with is one of several surfaces: it tells no noise.
+_ONE_SURFACE = 0.8
 # Root of the Tukey-weighted mean square of Gaussian residuals, cut at four sigma, in sigmas.
 _TUKEY_SHRINKAGE = 0.873
 
@@ -25,8 +33,9 @@ class Surfaces:
     centres (S, 3): the mean of the neighbours; feet (S, 3): the fitted surface at the site; normals (S, 3), sign
     arbitrary; directions (S, 3): of least curvature; curvature (S,) [1/m]: the greater principal one, positive where
     the surface bends towards -normal; second (S,): the other; sigma (S,): its standard deviation by the noise;
-    rms (S,) [m] of the residuals and inliers (S,): their share; spread (S, 3): standard deviations [m] of the
-    neighbours along their principal directions, ascending; line (S, 3): the direction of greatest spread.
+    rms (S,) [m] of the residuals and inliers (S,): their share; count (S,) of the neighbours; spread (S, 3): standard
+    deviations [m] of the neighbours along their principal directions, ascending; line (S, 3): the direction of
+    greatest spread.
     """
 
     scale: float
@@ -192,26 +201,16 @@ def _fit_sites(
     table = np.zeros((len(sites), 23))
     count = np.zeros(len(sites), np.int64)
     ranges = np.zeros((27, 2), np.int64)
-    found, last = 0, -1
-    buffer = np.empty((1024, 3))
+    cells, last = 0, -1
+    buffer = np.empty((_MOST_NEIGHBOURS, 3))
     for s in range(len(sites)):
         if site_cells[s] != last:
             last = site_cells[s]
-            found = neighbour_ranges(last, cell_keys, cell_starts, level, ranges)
-        n = 0
-        for r in range(found):
-            for i in range(ranges[r, 0], ranges[r, 1]):
-                dx = points[i, 0] - sites[s, 0]
-                dy = points[i, 1] - sites[s, 1]
-                dz = points[i, 2] - sites[s, 2]
-                if dx * dx + dy * dy + dz * dz <= scale * scale and n < len(buffer):
-                    buffer[n, 0] = points[i, 0]
-                    buffer[n, 1] = points[i, 1]
-                    buffer[n, 2] = points[i, 2]
-                    n += 1
-        if n < _LEAST_POINTS:
+            cells = neighbour_ranges(last, cell_keys, cell_starts, level, ranges)
+        found, kept = _neighbours(points, ranges[:cells], sites[s], scale, buffer)
+        if found < _LEAST_POINTS:
             continue
-        near = buffer[:n]
+        near = buffer[:kept]
         mean, spread, axes = _principal(near)
         out = table[s]
         out[0:3] = mean
@@ -222,37 +221,83 @@ def _fit_sites(
         out[3:6] = mean
         out[15] = spread[0]
         out[16] = 1.0
-        count[s] = n
-        # Flat within the noise: a curvature that matters would thicken the patch.
-        if spread[0] < 0.7 * sigma:
-            continue
-        frame = np.empty((3, 3))
-        frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
-        q, rms, share, variance = _solve_quadric(near, sites[s], frame, scale, sigma, 4)
-        out[15] = rms
-        out[16] = share
-        if share == 0.0:
-            continue
-        # Hessian of the height over the tangent plane, in 1/m.
-        hxx, hxy, hyy = 2.0 * q[3] / scale, q[4] / scale, 2.0 * q[5] / scale
-        half = 0.5 * np.sqrt((hxx - hyy) ** 2 + 4.0 * hxy * hxy)
-        mid = 0.5 * (hxx + hyy)
-        k1, k2 = mid + half, mid - half
-        angle = 0.5 * np.arctan2(2.0 * hxy, hxx - hyy)
-        if abs(k2) > abs(k1):
-            k1, k2 = k2, k1
-            angle += 0.5 * np.pi
-        slope = np.sqrt(1.0 + q[1] * q[1] + q[2] * q[2])
-        normal = (frame[2] - q[1] * frame[0] - q[2] * frame[1]) / slope
-        direction = -np.sin(angle) * frame[0] + np.cos(angle) * frame[1]
-        direction = direction - (direction @ normal) * normal
-        out[3:6] = sites[s] + q[0] * scale * frame[2]
-        out[6:9] = normal
-        out[9:12] = direction / np.sqrt(direction @ direction)
-        out[12] = -k1 / slope**3
-        out[13] = -k2 / slope**3
-        out[14] = 2.0 * np.sqrt(variance) * sigma / (scale * scale)
+        count[s] = found
+        if spread[0] >= _FLAT * sigma:
+            _fit_quadric(near, sites[s], axes, scale, sigma, out)
     return table, count
+
+
+@njit(cache=True, nogil=True)
+def _neighbours(
+    points: FloatArray, ranges: IntArray, site: FloatArray, scale: float, buffer: FloatArray
+) -> tuple[int, int]:
+    """Copies the points within `scale` [m] of a site to the buffer, an even subset where it is too short.
+
+    Returns the number of points, and of those that were copied.
+    """
+    found = _copy_neighbours(points, ranges, site, scale, buffer, 1)
+    if found <= len(buffer):
+        return found, found
+    step = -(-found // len(buffer))
+    _copy_neighbours(points, ranges, site, scale, buffer, step)
+    return found, -(-found // step)
+
+
+@njit(cache=True, nogil=True)
+def _copy_neighbours(
+    points: FloatArray, ranges: IntArray, site: FloatArray, scale: float, buffer: FloatArray, step: int
+) -> int:
+    """Copies every `step`-th point within `scale` [m] while there is room; returns the number of points there."""
+    found = 0
+    for r in range(len(ranges)):
+        for i in range(ranges[r, 0], ranges[r, 1]):
+            dx = points[i, 0] - site[0]
+            dy = points[i, 1] - site[1]
+            dz = points[i, 2] - site[2]
+            if dx * dx + dy * dy + dz * dz <= scale * scale:
+                row = found // step
+                if row < len(buffer) and row * step == found:
+                    buffer[row, 0] = points[i, 0]
+                    buffer[row, 1] = points[i, 1]
+                    buffer[row, 2] = points[i, 2]
+                found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _fit_quadric(
+    near: FloatArray, site: FloatArray, axes: FloatArray, scale: float, sigma: float, out: FloatArray
+) -> None:
+    """Writes foot, normal, direction, curvatures, their sigma, rms and inlier share of a site to its row of the table.
+
+    Where too few points agree with a quadric only the last two are written, the share as 0.
+    """
+    frame = np.empty((3, 3))
+    frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
+    q, rms, share, variance = _solve_quadric(near, site, frame, scale, sigma, 4)
+    out[15] = rms
+    out[16] = share
+    if share == 0.0:
+        return
+    # Hessian of the height over the tangent plane, in 1/m.
+    hxx, hxy, hyy = 2.0 * q[3] / scale, q[4] / scale, 2.0 * q[5] / scale
+    half = 0.5 * np.sqrt((hxx - hyy) ** 2 + 4.0 * hxy * hxy)
+    mid = 0.5 * (hxx + hyy)
+    k1, k2 = mid + half, mid - half
+    angle = 0.5 * np.arctan2(2.0 * hxy, hxx - hyy)
+    if abs(k2) > abs(k1):
+        k1, k2 = k2, k1
+        angle += 0.5 * np.pi
+    slope = np.sqrt(1.0 + q[1] * q[1] + q[2] * q[2])
+    normal = (frame[2] - q[1] * frame[0] - q[2] * frame[1]) / slope
+    direction = -np.sin(angle) * frame[0] + np.cos(angle) * frame[1]
+    direction = direction - (direction @ normal) * normal
+    out[3:6] = site + q[0] * scale * frame[2]
+    out[6:9] = normal
+    out[9:12] = direction / np.sqrt(direction @ direction)
+    out[12] = -k1 / slope**3
+    out[13] = -k2 / slope**3
+    out[14] = 2.0 * np.sqrt(variance) * sigma / (scale * scale)
 
 
 @njit(cache=True, nogil=True)
@@ -268,6 +313,6 @@ def _patch_residuals(points: FloatArray, first: IntArray, last: IntArray, scale:
         frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
         wide = max(spread[0], 1e-6)
         _, rms, share, _ = _solve_quadric(near, mean, frame, scale, wide, 3)
-        if share > 0.8:
+        if share > _ONE_SURFACE:
             out[c] = rms * np.sqrt(len(near) / max(len(near) - 6.0, 1.0))
     return out
