@@ -22,7 +22,8 @@ from pipeprog_detect.verification.scene_context import SceneContext
 # Of all pairs of sites a hundredth lie on one pipe even where nine tenths of the sites are stray: 400 good ones remain.
 _PAIRS = 40_000
 _MOST_SITES = 4_000
-# Hypotheses that are sharpened, in so many random steps each, from a tenth of the radius down to a hundredth.
+# The 48 best hypotheses are sharpened by 400 random steps each, which shrink from a tenth of the radius to a hundredth;
+# the 12 best of them are measured.
 _STARTS, _STEPS = 48, 400
 _FIRST_STEP, _LAST_STEP = 0.1, 0.01
 _BEST = 12

@@ -17,8 +17,9 @@ _SECTORS = 36
 # A bin of the barrel is seen where its points cover this angle, a bin is empty under this share of its neighbours.
 _LEAST_ARC = np.radians(30.0)
 _LEAST_SHARE = 0.25
-# Pipes sag and clouds wave by this much [m]; an elbow leaves the line by more within a fraction of its radius.
-_WAVINESS = 3e-3
+# Deviation [m] of a pipe's axis from a line by sagging and by the waviness of clouds, over its whole length; an elbow
+# leaves the line by more within a fraction of its radius.
+_AXIS_WAVINESS = 3e-3
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def straight_interval(points: FloatArray, cylinder: Cylinder, sigma: float) -> I
     known = np.flatnonzero(np.isfinite(error))
     if len(known) < 4:
         return Interval(low, low + length)
-    allowed = 2.5 * error + _WAVINESS + 0.02 * cylinder.radius
+    allowed = 2.5 * error + _AXIS_WAVINESS + 0.02 * cylinder.radius
     centre = np.asarray(low + (np.arange(slices) + 0.5) * size, np.float64)
     line = _best_line(centre[known], shift[known], allowed[known], max(slices // 6, 1) * size)
     if not line.any():
@@ -106,7 +107,7 @@ def straight_interval(points: FloatArray, cylinder: Cylinder, sigma: float) -> I
     longest = max(parts, key=len)
     slope, origin = _fit_line(centre[longest], shift[longest], np.asarray(1.0 / error[longest]))
     off = np.linalg.norm(shift - origin - centre[:, None] * slope, axis=1)
-    deviation: FloatArray = np.where(off > 2.5 * error + 0.5 * _WAVINESS, off, np.nan)
+    deviation: FloatArray = np.where(off > 2.5 * error + 0.5 * _AXIS_WAVINESS, off, np.nan)
     edges = low + longest[0] * size, low + (longest[-1] + 1) * size
     return Interval(
         _onset(edges[0], centre[: longest[0]][::-1], deviation[: longest[0]][::-1], cylinder.radius),

@@ -10,22 +10,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 
-# Five-point samples for which one is clean at 99 % where half of the points are stray.
+# Five-point samples: log 0.01 / log(1 - 1/32), so that one of them has no stray point at 99 % where half are stray.
 _SAMPLES = 146
+# Of the ellipses sampled, these cost least and are refined, twice each: the first refinement starts beside the minimum.
 _BEST = 5
 _CONCENTRATIONS = 2
+# Points of an ellipse: five times its parameters. Part of it that they cover: less leaves the axes undetermined.
 _LEAST_POINTS = 25
 _LEAST_ARC = np.radians(90.0)
-# Flatter than this is no pipe that the plane cuts across; stray points within twice the band, shared interior at most.
+# Minor over major semi-axis: a plane that meets an axis at less than 9 deg does not cut the pipe across.
 _LEAST_ASPECT = 0.15
+# Points within the inlier band, as a share of those within twice the band: of evenly stray points half are.
 _LEAST_SHARE = 0.6
+# Share of an ellipse's interior within an earlier one: pipes do not overlap, their measured sections may by the noise.
 _MOST_OVERLAP = 0.2
+# Points within this multiple of the noise belong to an ellipse: 99 % of its own do.
 _INLIER = 2.5
 
 
@@ -40,11 +43,6 @@ class Ellipse:
     inliers: IntArray
 
 
-def confocal_distance(points: FloatArray, ellipse: FloatArray) -> FloatArray:
-    """Signed distances (N,) [m], positive outside, of points (N, 2) from an ellipse (x, y, major, minor, angle)."""
-    return _distances(np.ascontiguousarray(points), ellipse)
-
-
 def components(points: FloatArray, least: int = _LEAST_POINTS) -> list[IntArray]:
     """Rows of the connected components of points (N, 2), the largest first, those under `least` points left out.
 
@@ -53,14 +51,13 @@ def components(points: FloatArray, least: int = _LEAST_POINTS) -> list[IntArray]
     """
     if len(points) < least:
         return []
-    tree = cKDTree(points)
-    nearest = tree.query(points, k=2)[0][:, 1]
+    from sklearn.cluster import DBSCAN  # half a second that only this front end needs
+
+    nearest = cKDTree(points).query(points, k=2)[0][:, 1]
     reach = float(np.clip(8.0 * np.median(nearest), 5e-3, 30e-3))
-    pairs = tree.query_pairs(reach, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    count, label = connected_components(graph, directed=False)
+    label = DBSCAN(eps=reach, min_samples=1).fit(points).labels_  # with one sample density is connectedness
     order = np.argsort(label, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1])
+    parts = np.split(order, np.cumsum(np.bincount(label))[:-1])
     return sorted((part for part in parts if len(part) >= least), key=len, reverse=True)
 
 
@@ -214,6 +211,7 @@ def _distance(px: float, py: float, e: FloatArray, cosine: float, sine: float) -
 
 @njit(cache=True)
 def _distances(points: FloatArray, ellipse: FloatArray) -> FloatArray:
+    """Signed distances (N,) [m], positive outside, of points (N, 2) from an ellipse (x, y, major, minor, angle)."""
     cosine, sine = np.cos(ellipse[4]), np.sin(ellipse[4])
     out = np.empty(len(points))
     for i in range(len(points)):

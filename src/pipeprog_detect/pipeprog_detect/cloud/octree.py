@@ -17,6 +17,9 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 
 # For loops over independent parts; what they give does not depend on it.
 THREADS = min(os.cpu_count() or 1, 8)
+# Cells [m] by which points near a segment are looked up: about as wide as a pipe, so that few cells lie near one and
+# few of their points do not. The nearest level of the tree is taken.
+_LOOKUP_CELL = 0.0625
 # 21 bits an axis fill an int64 key; 1/32 mm is far below any cloud's noise and spans 65 m.
 _BITS = 21
 _FINEST = 2.0**-15
@@ -85,7 +88,7 @@ class Octree:
 
     def near_segment(self, start: FloatArray, end: FloatArray, distance: float) -> IntArray:
         """Rows, ascending, of the points in the cylinder of radius `distance` [m] with flat ends about a segment."""
-        cells = self.cells(self.level_of(0.0625))
+        cells = self.cells(self.level_of(_LOOKUP_CELL))
         length = float(np.linalg.norm(end - start))
         axis = (end - start) / length
         slack = 0.5 * float(np.sqrt(3.0)) * cells.size

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud.octree import Cells, Octree, decode, encode
 
-# Real walls, and walls in real clouds, are flat to a millimetre over a few decimetres, no better.
-_WAVINESS = 1e-3
+# Deviation [m] of a wall, and of a fused cloud of it, from a plane over a few decimetres.
+_WALL_WAVINESS = 1e-3
+# Cells [m] whose flatness is judged: wide enough that noise of millimetres does not turn their normals by 12 deg, which
+# neighbours of one wall agree within, and narrow enough for the front of a duct.
+_FLAT_CELL = 0.0625
 
 
 @dataclass(frozen=True)
@@ -30,11 +33,11 @@ def find_planes(tree: Octree, sigma: float, widest_radius: float) -> tuple[list[
     Flat cells grow into regions of one plane. On a cylinder of radius R the strip within +-b of a plane is
     2 sqrt(4 R b) wide at most, so a region wider than that for the widest pipe sought is none of its surface.
     """
-    cells = tree.cells(tree.level_of(0.0625))
-    band = 3.0 * sigma + _WAVINESS
+    cells = tree.cells(tree.level_of(_FLAT_CELL))
+    band = 3.0 * sigma + _WALL_WAVINESS
     least_width = max(2.4 * np.sqrt(4.0 * widest_radius * band), 3.0 * cells.size)
     mean, normal, thickness, breadth, weight = _cell_planes(tree.points, cells.starts)
-    flat = (thickness < 1.7 * sigma + 0.5 * _WAVINESS) & (breadth > 0.15 * cells.size) & (weight >= 8)
+    flat = (thickness < 1.7 * sigma + 0.5 * _WALL_WAVINESS) & (breadth > 0.15 * cells.size) & (weight >= 8)
     neighbours = _cell_neighbours(cells)
     label = _grow(mean, normal, thickness, flat, neighbours, band, np.cos(np.radians(12.0)))
     planes: list[Plane] = []

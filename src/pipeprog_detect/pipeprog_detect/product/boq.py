@@ -20,6 +20,7 @@ Color = tuple[float, float, float]
 _RELATIVE_TOLERANCE = 0.01
 _LEAST_TOLERANCE = 1e-4
 
+# Names without matplotlib's values, and at once; its other names of CSS are taken, too.
 NAMED_COLORS: dict[str, Color] = {
     "black": (0.0, 0.0, 0.0),
     "blue": (0.0, 0.0, 1.0),
@@ -224,5 +225,10 @@ def _read_color(path: Path, name: str, value: object) -> Color:
         return NAMED_COLORS[text]
     if re.fullmatch(r"#[0-9a-f]{6}", text):
         return (int(text[1:3], 16) / 255, int(text[3:5], 16) / 255, int(text[5:7], 16) / 255)
-    near = difflib.get_close_matches(text, NAMED_COLORS, n=1, cutoff=0.0)[0]
+    from matplotlib.colors import CSS4_COLORS, to_rgb  # a quarter of a second that only other names need
+
+    if text in CSS4_COLORS:
+        red, green, blue = to_rgb(text)
+        return (red, green, blue)
+    near = difflib.get_close_matches(text, [*NAMED_COLORS, *CSS4_COLORS], n=1, cutoff=0.0)[0]
     raise InputError(f"{path}: class '{name}': unknown color '{value}': did you mean '{near}'? #rrggbb is fine too")

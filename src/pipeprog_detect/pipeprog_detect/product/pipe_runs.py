@@ -14,7 +14,7 @@ from pipeprog_detect.types import Cylinder, Pipe
 
 # Axes that a fitting joins meet within this share of the radius, and what their measurement may be off by [m].
 _MISS, _LEAST_MISS = 0.3, 5e-3
-# A turn below this is a coupling's, not an elbow's; above the other no fitting turns back so far.
+# A turn [rad] below the first is a coupling's, not an elbow's; no fitting turns by more than the second.
 _STRAIGHT, _SHARPEST = np.radians(8.0), np.radians(135.0)
 # Bends turn about up to five diameters; their sockets add up to a diameter. Radii of one size agree within a quarter.
 _WIDEST_BEND, _SOCKET = 10.0, 2.0

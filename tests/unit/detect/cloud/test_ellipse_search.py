@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.ellipse_search import components, confocal_distance, find_ellipses
+from pipeprog_detect.cloud.ellipse_search import _distances, components, find_ellipses
 
 SIGMA = 1e-3
 
@@ -28,14 +28,14 @@ def test_the_confocal_distance_is_the_distance(aspect: float, turn: float, place
     # A search may end in a local minimum at the tip of a long ellipse; a grid does not.
     angles = np.asarray(place + np.linspace(-0.5, 0.5, 20001), float)
     nearest = np.linalg.norm(on_ellipse(angles, ellipse) - point, axis=1).min()
-    distance = confocal_distance(point[None], ellipse)[0]
+    distance = _distances(point[None], ellipse)[0]
     assert abs(distance) == pytest.approx(nearest, abs=0.01)
     assert distance * off >= -1e-12
 
 
 def test_a_circle_is_an_ellipse_too() -> None:
     points = np.array([[0.5, 0.0], [0.0, 2.0], [0.0, 1.0]])
-    np.testing.assert_allclose(confocal_distance(points, np.array([0, 0, 1.0, 1.0, 0.3])), [-0.5, 1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(_distances(points, np.array([0, 0, 1.0, 1.0, 0.3])), [-0.5, 1.0, 0.0], atol=1e-9)
 
 
 def test_components_are_apart() -> None:

@@ -39,6 +39,11 @@ classes:
     assert all(0 < c.tolerance < 0.02 * c.outer_radius for c in classes)
 
 
+def test_colours_that_css_names(tmp_path: Path) -> None:
+    (tomato,) = load_boq(written(tmp_path, entry("outer_radius_mm: 36.5, color: Tomato"))).classes
+    assert tomato.color == pytest.approx((1.0, 99 / 255, 71 / 255))
+
+
 @pytest.mark.parametrize(
     ("size", "diameter_mm"),
     [
