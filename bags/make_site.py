@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make a recording of a synthetic construction site, with its ground truth, bill of quantities and board."""
 
 from __future__ import annotations

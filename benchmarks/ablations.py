@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What each stage brings: the labs measured whole, and with one stage left out at a time.
 
     .venv/bin/python -m benchmarks.ablations [--seeds 1 2 3] [--size 720p]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Experiment 1 of the paper: how many views of the board the scale takes, circle centres corrected or not.
 
     .venv/bin/python -m benchmarks.board_views [SURVEY RECORDING ...]

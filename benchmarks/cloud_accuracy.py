@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far a survey's cloud lies from the true surfaces, and how much of the true pipes it covers.
 
     .venv/bin/python -m benchmarks.cloud_accuracy [demo] [lab:SEED] [field:SEED]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far off a start may be: the cloud's fit and the refinement by outlines, from many wrong starts each.
 
     .venv/bin/python -m benchmarks.convergence cloud [--trials 10]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time and memory of the detector, stage by stage, as the cloud grows.
 
     .venv/bin/python -m benchmarks.cost [--points 0.3 1 3 12]

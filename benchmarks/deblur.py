@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether undoing motion blur helps the reconstruction: the mapper on blurred recordings, without and with it.
 
     .venv/bin/python -m benchmarks.deblur

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's Experiments 1 to 4 on generated sites: its figures, its method to the letter, and ours.
 
     .venv/bin/python -m benchmarks.experiments [--methods paper ours] [--layouts lab field] [--overlaps 95]

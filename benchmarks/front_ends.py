@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The detector's front ends side by side on scanned sites with exact truth.
 
     .venv/bin/python -m benchmarks.front_ends [--seeds 21 22] [--noise-mm 1 3]

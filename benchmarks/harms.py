@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether harm is noticed: each deliberate mistake below is put into the code at run time, and the tests must fail.
 
     .venv/bin/python -m benchmarks.harms

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the keyframes of a 30 Hz recording cost in accuracy: the camera's path from them and from every frame.
 
     .venv/bin/python -m benchmarks.keyframe_path [RECORDING]

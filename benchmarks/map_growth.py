@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time per keyframe as the map grows: ten minutes of walking along a corridor and back, a keyframe a second.
 
     .venv/bin/python -m benchmarks.map_growth [MINUTES]

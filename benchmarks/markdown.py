@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Markdown of tables and lists, for the documents that are written from results/."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pictures of docs/method.md, one a stage, from the results of the demo.
 
     make demo

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions that a selector must survive: a fast turn, a long stop, a covered lens, a walk there and back.
 
     .venv/bin/python -m benchmarks.motions [MOTION ...]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Public detectors of cylinders on one cloud; run by benchmarks.peers in an environment of their own.
 
     python peer_detectors.py DETECTOR POINTS.npy OUT.json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Public detectors of pipes beside ours: the same scanned clouds, the same scorer, one run.
 
     .venv/bin/python -m benchmarks.peers [--seeds 21] [--noise-mm 1 3] [--layouts lab field]

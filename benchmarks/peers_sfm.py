@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Structure from motion against batch COLMAP on the same keyframes: CPU time, poses, and how many are registered.
 
     .venv/bin/python -m benchmarks.peers_sfm [demo] [BAG.mcap ...] [--every N]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recordings that the benchmarks measure: made once by the generator in bags/, kept in out/recordings."""
 
 from __future__ import annotations

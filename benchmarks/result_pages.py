@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One page an experiment, docs/results/*.md, from the JSON files in results/."""
 
 from __future__ import annotations

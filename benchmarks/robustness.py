@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the result suffers when the recording does: one factor at a time, against the same site filmed well.
 
     .venv/bin/python -m benchmarks.robustness [FACTOR ...]

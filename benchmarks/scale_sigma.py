@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stated scale sigma against the true error: twenty sites of the generator, each with a board of its own printing.
 
     .venv/bin/python -m benchmarks.scale_sigma [SEEDS]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What choosing a frame costs beside decoding it: one run over one recording, at its size and at 4K.
 
     .venv/bin/python -m benchmarks.selector_cost [demo] [lab:SEED[:OPTION...]] [BAG.mcap ...]

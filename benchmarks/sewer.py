@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real clouds from inside sewer pipes: the nominal size that the detector tells, cloud by cloud.
 
     .venv/bin/python -m benchmarks.sewer FOLDER

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Memory of the selector over ten minutes of a 4K camera at 30 Hz: tracker, selector and live ring, as fast as it goes.
 
     .venv/bin/python -m benchmarks.stream_memory [BAG.mcap] [--minutes 10]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One recording through the node graph as a user would send it, scored against its truth: a JSON file with its command.
 
     .venv/bin/python -m benchmarks.survey [demo] [lab:SEED[:OPTION...]] [field:SEED[:OPTION...]] [BAG.mcap] [--set ...]

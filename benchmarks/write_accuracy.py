@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes docs/accuracy.md, docs/results/, docs/recording.md and the README's table from results/: no figure is typed.
 
 .venv/bin/python -m benchmarks.write_accuracy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recording guide, docs/recording.md: what to do on site, each advice with what was measured."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pipes in a NumPy cloud, here a simulated scan of two pipes before a wall: how well do they come back?
 
 python examples/detect_on_a_cloud.py

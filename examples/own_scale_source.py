@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A scale source of one's own: a total station has tracked the prism on the camera, and its track gives the metres.
 
     python examples/own_scale_source.py

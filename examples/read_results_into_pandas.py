@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A results folder as pandas tables: metres a class, and how sure each radius is.
 
     python examples/read_results_into_pandas.py out/demo      (after `make demo`)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A survey from Python: images, their camera and a board file in; poses, a metric cloud and pipes out, without ROS.
 
     python examples/survey_from_python.py bags/demo.mcap bags/demo.board.yaml bags/demo.boq.yaml

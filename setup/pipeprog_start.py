@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Start-up hook of the virtual environment: pipeprog and its messages are found with nothing sourced.
 
 `make setup` copies this file into site-packages, beside a .pth file that imports it when Python starts.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keeps every test run to itself: a ROS domain that no replay and no other run holds, on this machine alone."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the files of a results folder must look like."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The field: 58 pipes of six radii in a plant room, with racks, crossings, elbows, clamps and clutter."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The lab: a room corner with six pipes of five radii, an elbow, clamps, a duct and one board."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a robot that carries the camera would tell of its motion: odometry, IMU, and where the camera is mounted."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The solids a site is built of, each in a local frame of its own, and their materials.
 
 Every primitive is a rigid frame (`origin`, `rotation` whose rows are the local axes in world coordinates) and a few

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rays against primitives: canonical intersections, and a bounding volume hierarchy over them."""
 
 from __future__ import annotations

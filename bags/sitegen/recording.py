@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recording on disk: NAME.mcap with images and calibration, and NAME.truth.json, .boq.yaml, .board.yaml."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images of a site: one ray through the middle of each pixel, sixteen where it meets an outline or a shadow's edge."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cloud that a scanner takes of a site: what its rays meet first, with noise along them."""
 
 from __future__ import annotations

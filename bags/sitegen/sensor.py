@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the light of a site to a JPEG: exposure, shutter, lens blur, noise."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A site under construction: primitives with what is true of them, and the builders that layouts use."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Solid procedural textures: seeded lattice noise, faded out where a pixel can no longer resolve it."""
 
 from __future__ import annotations

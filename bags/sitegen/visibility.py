@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What of a site a recording shows: coverage of each pipe, and the true surface the camera saw."""
 
 from __future__ import annotations

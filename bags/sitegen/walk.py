@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera's path: a smooth curve through waypoints at a steady speed, and a hand that holds the camera."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The gate: a fixed small set of recordings through the graph, held against the bounds in bounds.yaml."""
 
 from __future__ import annotations

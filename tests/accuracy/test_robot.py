@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Metres without a board: a robot's odometry, IMU and mounting in the recording, held against the truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stands for any of the three nodes: the same topics and services, no computing. What goes wrong is said by FAKE."""
 
 from __future__ import annotations

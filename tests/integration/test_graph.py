@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole graph, real nodes over real DDS, on the first board of the demo recording: replayed and live."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command's side of a replay: real processes over real DDS, with nodes that only count."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The death of the reconstruction's process: a live node begins it anew, a replay ends with its reason."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rules that hold the house up (docs/architecture.md), read from the sources."""
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ FOLDERS = {
         "playback": {"recording", "results"},
     },
 }
+LICENCE = "# SPDX-License-Identifier: Apache-2.0"
 SHARED = {"config", "types"}
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|launch(_ros)?|tf2_ros|ament_index_python")
 
@@ -176,3 +178,10 @@ def test_manifest_of_the_messages_names_the_packages_they_use() -> None:
         used |= set(re.findall(r"^(\w+)/\w+", path.read_text(), re.MULTILINE))
     declared = {element.text for element in manifest(package).findall("depend")}
     assert used <= declared
+
+
+def test_every_python_file_names_its_licence() -> None:
+    folders = ("src", "bags", "benchmarks", "examples", "setup", "tests")
+    files = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py")) if "build" not in path.parts]
+    lacking = [str(path.relative_to(ROOT)) for path in files if LICENCE not in path.read_text().splitlines()[:2]]
+    assert not lacking, f"begin them with `{LICENCE}`"

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the documents name is there: files, modules, headings, commands with their options, settings."""
 
 from __future__ import annotations

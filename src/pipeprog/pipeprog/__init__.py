@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """pipeprog from Python: notebooks and scripts, without ROS.
 
     import pipeprog

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pipes of a NumPy cloud: the detector's core with arrays in place of files."""
 
 from __future__ import annotations

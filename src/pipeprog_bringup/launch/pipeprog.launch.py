@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The graph on a robot: frames, sfm and detect on the topics of one camera.
 
 ros2 launch pipeprog_bringup pipeprog.launch.py boq:=site.yaml board:=board.yaml image:=/camera/image_raw \

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The graph on a recording, played by `ros2 bag play` in its own time, as on the robot.
 
 ros2 launch pipeprog_bringup replay.launch.py bag:=survey.mcap boq:=site.yaml board:=board.yaml

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command `pipeprog`.
 
 Whatever takes long to import is imported inside the commands, so that --help answers at once.

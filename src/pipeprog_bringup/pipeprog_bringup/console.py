@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the command shows: progress on stderr, tables on stdout."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`pipeprog detect`: the detector's core on a cloud from a file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`pipeprog ingest`: a video and its camera's calibration become a recording."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A cutting plane drawn as a line on a keyframe: the plane through the camera's centre and both rays."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/parameters.md from the settings dataclasses.
 
 python -m pipeprog_bringup.parameters_doc > docs/parameters.md

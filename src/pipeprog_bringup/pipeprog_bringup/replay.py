@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`pipeprog replay`: a recording through the node graph, frame by frame, without losing one."""
 
 from __future__ import annotations

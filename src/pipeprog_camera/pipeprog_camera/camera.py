@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A calibrated camera, as sensor_msgs/CameraInfo describes it."""
 
 from __future__ import annotations

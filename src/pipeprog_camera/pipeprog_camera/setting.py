@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One setting of a settings dataclass, in two lines."""
 
 from __future__ import annotations

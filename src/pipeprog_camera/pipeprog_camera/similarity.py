@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The least-squares similarity between two sets of points."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Candidates in the cloud: what is known already, then what bent patches, lines or sections of planes propose."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the detector, one dataclass per stage; DetectConfig holds them all."""
 
 from __future__ import annotations

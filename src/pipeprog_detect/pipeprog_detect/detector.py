@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The detector: from a metric cloud to classified pipes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pipes seen from inside: a camera in a sewer sees a concave cylinder around it, among stray points.
 
 Near and half-dark, such clouds are too torn for curvature and for following a pipe along its axis: two normals that

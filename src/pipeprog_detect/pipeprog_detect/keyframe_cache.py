@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The keyframes of a survey as the detector wants them: grey, undistorted, decoded once while memory allows."""
 
 from __future__ import annotations

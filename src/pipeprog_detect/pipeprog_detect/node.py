@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The detector as a ROS 2 node: map points, poses and keyframes in; pipes and their markers out."""
 
 from __future__ import annotations

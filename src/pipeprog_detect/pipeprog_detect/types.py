@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the detector takes and returns: clouds, views, cylinders, pipes."""
 
 from __future__ import annotations

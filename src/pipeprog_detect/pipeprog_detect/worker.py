@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The process that detects: seconds of computing that the node's callbacks must not wait for."""
 
 from __future__ import annotations

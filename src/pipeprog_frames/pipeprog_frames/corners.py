@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Corners to track, the best of each cell of an image (Shi and Tomasi, CVPR 1994), and the sharpness of an image.
 
 cv2.cornerMinEigenVal with an argmax per cell finds the same corners (112 of 112 on a frame of the demo) in 0.30 ms;

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The decision on a frame, and the frame while none has been made."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decodes images at the reduced size that the tracker needs."""
 
 from __future__ import annotations

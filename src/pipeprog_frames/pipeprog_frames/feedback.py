@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Corrections of a stream of keyframes by the SfM's overlap reports: frames added in weak places, others retired."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stores of the compressed frames that may still become keyframes: bounded memory live, a file in a replay."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Algorithm 1 of the paper: chooses the images of a recording so that their overlap is within a band."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which keyframes and retirements were published, and which of them the SfM has answered to."""
 
 from __future__ import annotations

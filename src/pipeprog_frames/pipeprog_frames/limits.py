@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When a keyframe is due: limits of overlap and parallax, which are relaxed while the SfM cannot keep up."""
 
 from __future__ import annotations

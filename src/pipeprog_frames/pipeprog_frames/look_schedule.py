@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which frames are worth decoding: none while the motion so far says that no keyframe is due for long."""
 
 from __future__ import annotations

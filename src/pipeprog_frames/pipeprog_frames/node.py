@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frame selector as a ROS 2 node: images in, keyframes out."""
 
 from __future__ import annotations

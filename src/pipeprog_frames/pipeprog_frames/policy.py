@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What chooses keyframes: a policy is shown every frame and the SfM's overlap reports, and returns decisions."""
 
 from __future__ import annotations

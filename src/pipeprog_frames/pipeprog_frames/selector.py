@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decides, frame by frame, which become keyframes: the last sharp one before the overlap runs out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keyframes of a stream: a fast prediction chooses at once, and the SfM's overlap reports correct the choice."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Predicts overlap and parallax with the last keyframe by tracking corners in reduced images."""
 
 from __future__ import annotations

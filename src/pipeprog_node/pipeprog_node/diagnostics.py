@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The health of a node on /diagnostics, once a second (REP-107)."""
 
 from __future__ import annotations

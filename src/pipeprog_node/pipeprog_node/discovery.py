@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which nodes of the graph are on a topic, by their names: a count would take a viewer for one of them."""
 
 from __future__ import annotations

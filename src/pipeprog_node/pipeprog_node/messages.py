@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Standard messages from and to NumPy arrays and pipeprog's types."""
 
 from __future__ import annotations

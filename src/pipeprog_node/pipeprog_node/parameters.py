@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings dataclasses as ROS parameters."""
 
 from __future__ import annotations

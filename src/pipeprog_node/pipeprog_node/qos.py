@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Quality of service of pipeprog's topics, each kind with its reason.
 
 rclpy logs a warning by itself where the publisher and the subscription of a topic do not fit.

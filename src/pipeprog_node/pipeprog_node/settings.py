@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings dataclasses as flat lists of named values: what ROS parameters, the command line and the docs share.
 
 A nested dataclass is flattened with dots: field `max_pairs` of the field `stereo` is the setting `stereo.max_pairs`.

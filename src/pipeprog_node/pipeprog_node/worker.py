@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A child process for a node's heavy work, so that callbacks only enqueue and the node keeps answering."""
 
 from __future__ import annotations

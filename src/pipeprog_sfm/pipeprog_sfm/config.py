@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the reconstruction, one dataclass per stage; SfmConfig holds them all."""
 
 from __future__ import annotations

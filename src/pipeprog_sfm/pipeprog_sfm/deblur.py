@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Removes motion blur before feature extraction: blur from poses and exposure time, then Wiener deconvolution."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The commands that a process was given, on disk, so that another process can take its place."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the reconstruction's node publishes: overlap, poses, map and status."""
 
 from __future__ import annotations

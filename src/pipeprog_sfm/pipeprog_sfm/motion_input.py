@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odometry, TF and IMU messages of the reconstruction's node, collected until the next keyframe."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reconstruction as a ROS 2 node: keyframes in; map points, poses and overlaps out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keyframes in, a metric map out: the stages of the reconstruction, wired together."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reconstruction's process as its node sees it: commands in, and a new process when it dies."""
 
 from __future__ import annotations

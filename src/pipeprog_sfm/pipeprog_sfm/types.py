@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Types that several stages share."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Loads (the first time: compiles) what Numba compiles, before the first keyframe has to wait for it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loop of the reconstruction's process: commands of the node in, events for the node out.
 
 A process of its own, for two reasons. Its Python code would compete with the node's callbacks for the interpreter lock;

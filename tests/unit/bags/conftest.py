@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The generator is a command beside its package, not an installed one."""
 
 import sys

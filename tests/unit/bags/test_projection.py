@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the images show lies where the truth file says, to a small part of a pixel."""
 
 import cv2

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the generated robot tells, against the walk that it tells of."""
 
 import numpy as np

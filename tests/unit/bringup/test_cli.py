@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command as its users meet it: a process, its exit code and its stderr."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A line on a keyframe of a finished survey as the plane that cuts the pipes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Presets, the parameters page and the launch files agree with the settings and the packages."""
 
 from __future__ import annotations

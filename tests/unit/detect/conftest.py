@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fixtures of the contour tests: a ray-cast pipe before a textured wall with a lamp's shadow beside it."""
 
 from __future__ import annotations

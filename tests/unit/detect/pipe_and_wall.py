@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pipe and the wall of `pipe_views`, as points."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The detector from cloud to classified pipes on small scenes with exact truth."""
 
 from __future__ import annotations

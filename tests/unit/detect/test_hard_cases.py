@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What sites are full of, each scanned with exact truth: pipes that are hard to find, and what only looks like one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The detector's node between keyframes, maps and those who read `pipes`; its worker is the real one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each program of examples/ runs as its docstring says, and what it prints holds."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Corners and sharpness against OpenCV's own, which they replace for speed."""
 
 import cv2

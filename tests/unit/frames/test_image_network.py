@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Algorithm 1 and the stream's feedback on synthetic recordings: the SfM is a formula instead of a reconstruction."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The selector's node between a camera and an SfM that answers as it is told, all in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings as parameters of a real node, and the main function of nodes."""
 
 from __future__ import annotations

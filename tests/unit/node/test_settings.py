@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings dataclasses as flat names: built, checked, parsed and flattened again."""
 
 from __future__ import annotations

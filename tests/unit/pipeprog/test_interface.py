@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The Python interface as a notebook meets it: a process without ROS."""
 
 from __future__ import annotations

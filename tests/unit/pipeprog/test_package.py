@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The plain Python package: what `pip install .` gives on a machine without ROS."""
 
 from __future__ import annotations

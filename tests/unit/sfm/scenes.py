@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Synthetic scenes that the tests of the mapper and its parts share: points with random descriptors, seen on walks."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A camera, boards and their exact or rendered images for the tests of boards and scale."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion blur with a known spread, and what undoing it brings."""
 
 from __future__ import annotations

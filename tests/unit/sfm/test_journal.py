@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The journal: what was written down can be read again, elsewhere."""
 
 import pickle

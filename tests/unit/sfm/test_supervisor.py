@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The supervisor of the reconstruction's process: what a new process is given after a death."""
 
 from __future__ import annotations

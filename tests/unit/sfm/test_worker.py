@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loop of the reconstruction's process, with a reconstruction that answers at once and a scripted connection."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The connections that a session needs before its first image, and which of them are still missing."""
 
 from __future__ import annotations

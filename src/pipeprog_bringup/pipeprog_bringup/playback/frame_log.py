@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What became of each frame of a replay: which are still on their way, and why each was chosen or not."""
 
 from __future__ import annotations

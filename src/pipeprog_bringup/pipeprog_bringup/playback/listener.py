@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the nodes publish during a session: decisions, overlaps, status, diagnostics, and the last messages."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sends a recording into the graph: its images with their calibration, and the motion between them."""
 
 from __future__ import annotations

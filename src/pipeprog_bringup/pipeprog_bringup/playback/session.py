@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One session: a recording passes once through the running nodes, every frame in, the last messages out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a replay has found, written to its folder: the files of the survey, and out.mcap for viewers."""
 
 from __future__ import annotations

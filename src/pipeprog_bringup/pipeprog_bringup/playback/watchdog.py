@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Notices a session in which nothing moves any more, or a node that has fallen silent."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings: the images of one camera with its calibration, from an .mcap file or a rosbag2 folder."""
 
 from __future__ import annotations

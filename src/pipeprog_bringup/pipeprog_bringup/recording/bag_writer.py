@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes recordings: an mcap file of the ROS 2 profile that rosbag2 and Foxglove open."""
 
 from __future__ import annotations

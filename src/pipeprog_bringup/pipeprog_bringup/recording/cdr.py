@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera's messages as CDR bytes, without rclpy: read by hand, written by mcap_ros2.
 
 Reading needs the first fields only (a stamp, a size), must survive damaged messages, and recordings may lack the

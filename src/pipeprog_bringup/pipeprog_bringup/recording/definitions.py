@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message definitions in the form that recordings carry, from the .msg files of the ROS installation."""
 
 from __future__ import annotations

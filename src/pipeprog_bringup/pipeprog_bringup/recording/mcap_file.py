@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One mcap file, read record by record, so that a torn or damaged one gives all it still holds.
 
 A power loss takes the file's summary first; the walk over the record headers costs one small read per chunk and works

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`pipeprog report`: one HTML page, with everything in it, about one survey or several."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plots of the report, as SVG within the page."""
 
 from __future__ import annotations

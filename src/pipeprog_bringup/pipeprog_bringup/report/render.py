@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of a cloud with its pipes: points splatted and cylinders cast into a depth buffer, shaded by depth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A survey as its folder holds it, read back for the report."""
 
 from __future__ import annotations

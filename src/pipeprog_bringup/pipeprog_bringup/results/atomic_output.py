@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The folder of a run's results: all new files appear in it together, or none does."""
 
 from __future__ import annotations

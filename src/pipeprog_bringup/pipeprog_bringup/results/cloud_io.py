@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Point clouds from files, and to them: PLY, PCD, LAS/LAZ, E57 and text, in metres."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings given as node.param=value on the command line, checked before any node starts."""
 
 from __future__ import annotations

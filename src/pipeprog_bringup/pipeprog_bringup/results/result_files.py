@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The files of a run, as DESIGN and docs/architecture.md fix them: writers, and readers of what scoring needs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A results folder read back: tables as lists of rows, geometry as arrays; docs/files.md names every field."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Score a result against ground truth: found, classified, radius (Eq. 4), length (Eq. 5), scale, trajectory.
 
 Equations of Maalek, Lichti & Maalek; Eq. 4 is taken with the square that the paper's print lacks. A pipe is found by

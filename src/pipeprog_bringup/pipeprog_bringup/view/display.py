@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`pipeprog view`: a results folder in a window, as a picture, or its pipes as a mesh, by Open3D.
 
 Open3D works in a child process: where graphics libraries or a display are missing it may end its process, which must

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A results folder as Open3D geometries: cloud, pipes in the colours of their classes, cameras, the frame `map`.
 
 The one module that imports Open3D. It does so when it is imported itself, which a child process does (see `display`).

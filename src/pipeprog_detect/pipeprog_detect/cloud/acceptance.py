@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What makes a pipe of a candidate: one set of thresholds for pipes seen from outside, one for pipes from inside."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a pipe begins and ends along its axis, and which pieces are one pipe."""
 
 from __future__ import annotations

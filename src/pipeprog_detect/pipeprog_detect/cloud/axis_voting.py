@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where pipes may be: sites on curved patches vote for an axis and a radius, votes on one line make a hypothesis."""
 
 from __future__ import annotations

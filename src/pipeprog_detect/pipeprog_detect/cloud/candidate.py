@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a hypothesis to a measured cylinder with the evidence for and against it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How cylinders belong together: pieces of one pipe on one line, elbows between two pipes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The front end of the paper (Algorithm 3): pipes are sought as ellipses where a plane cuts them."""
 
 from __future__ import annotations

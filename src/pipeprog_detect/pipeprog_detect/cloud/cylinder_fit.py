@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Geometric least-squares fit of a cylinder at a known noise, blind to the wall behind the pipe."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ellipses among the points of a section: connected components, each searched for ellipses that do not overlap.
 
 The distance to an ellipse is the one along the confocal hyperbola through the point, which meets the ellipse at a

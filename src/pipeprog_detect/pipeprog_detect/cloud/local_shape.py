@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Local surface shape: normal, principal curvature and its direction from a quadric around each site."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a map shows more than the one before, so that pipes are sought there alone."""
 
 from __future__ import annotations

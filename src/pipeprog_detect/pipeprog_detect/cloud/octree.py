@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A linear octree: points sorted along the Morton curve, so that each cell of every level is one range of the array.
 
 One sort serves voxel thinning, neighbour search and gathering at all scales, and makes every later step independent

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Large planes (walls, floor, ceiling, ducts): never part of a pipe, and known when a pipe before them is fitted."""
 
 from __future__ import annotations

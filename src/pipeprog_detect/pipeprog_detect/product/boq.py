@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bill of quantities: which pipe classes are planned, how thick, how many metres."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which planned class a measured radius belongs to, or none; and how much of each class is installed."""
 
 from __future__ import annotations

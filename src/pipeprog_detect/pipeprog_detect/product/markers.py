@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a viewer shows of the pipes: a cylinder in the colour of its class and a label for each."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pipe runs: which pipes elbows, tees, reducers and couplings connect, and the metres along their centre line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The same pipe keeps its name from map to map."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The product of a survey: what a robot is told on `pipes`, and what the files of the results hold."""
 
 from __future__ import annotations

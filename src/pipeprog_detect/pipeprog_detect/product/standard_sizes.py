@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Outer diameters of standard pipe sizes, so that a bill of quantities may say `DN50 steel` in place of a radius.
 
 Steel: EN 10220 series 1 by DN, with which EN 10255 agrees but for DN150 (`DN150 EN 10255 steel`), ASME B36.10 by NPS

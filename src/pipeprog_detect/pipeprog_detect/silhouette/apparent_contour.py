@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The apparent contour of a circular cylinder: its two image lines in a view, and how they move with it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robust least squares of a cylinder on the limb edges of all views, with the sideways error of each view's pose."""
 
 from __future__ import annotations

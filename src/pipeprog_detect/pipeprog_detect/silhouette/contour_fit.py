@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The result of a cylinder's refinement by its apparent contour, with its standard deviations."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Refinement of a cylinder by its apparent contour in the keyframes: radius and axis from all views at once."""
 
 from __future__ import annotations

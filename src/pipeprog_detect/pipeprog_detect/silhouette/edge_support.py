@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Support: the share of a cylinder's visible contour samples at which several views show a limb edge."""
 
 from __future__ import annotations

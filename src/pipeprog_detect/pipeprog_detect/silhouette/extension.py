@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far a pipe goes on beyond its known part: along its axis, while the keyframes show its contour."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which cylinder the edges of all views agree on: a search of the whole range, so that no strong edge decides alone."""
 
 from __future__ import annotations

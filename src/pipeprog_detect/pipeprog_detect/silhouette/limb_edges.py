@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sub-pixel limb edges: a blurred model of the surface that curves away and of what lies behind it."""
 
 from __future__ import annotations

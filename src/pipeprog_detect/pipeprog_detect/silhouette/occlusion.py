@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What hides a part of a pipe from a view (other pipes, the cloud): a hidden part is no evidence against the pipe."""
 
 from __future__ import annotations

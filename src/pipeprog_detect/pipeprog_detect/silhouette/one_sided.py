@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pipes of a rack of which one side is hidden by a neighbour: what the cloud knows takes the place of that side."""
 
 from __future__ import annotations

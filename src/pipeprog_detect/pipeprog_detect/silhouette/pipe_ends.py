@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ends of a pipe in the keyframes: the end rim, seen on the unrolled barrel, where the contour stops."""
 
 from __future__ import annotations

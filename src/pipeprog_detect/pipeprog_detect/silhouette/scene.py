@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A scene: a cylinder, its views and what may hide it; samples its apparent contour and finds limb edges there."""
 
 from __future__ import annotations

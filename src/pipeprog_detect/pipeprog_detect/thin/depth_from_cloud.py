@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A thin pipe as it looks from where it is seen: its direction in the image is known well, its depth is the cloud's."""
 
 from __future__ import annotations

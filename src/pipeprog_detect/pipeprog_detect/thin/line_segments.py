@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Segment pairs in one keyframe: two nearly parallel lines no farther apart than the sides of a thin pipe."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thin pipes by triangulation: segment pairs in the keyframes that agree, over the views, on one cylinder in space."""
 
 from __future__ import annotations

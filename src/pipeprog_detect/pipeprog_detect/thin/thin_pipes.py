@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thin pipes of which the cloud shows too little: proposed by lines in the keyframes, put at their depth, measured."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A candidate's contour fits: from the cloud's cylinder, and with the radii that the bill of quantities plans."""
 
 from __future__ import annotations

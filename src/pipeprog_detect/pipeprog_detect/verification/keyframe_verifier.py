@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cloud's candidates before the keyframes: measured by their contours, kept as the cloud has them, or dropped."""
 
 from __future__ import annotations

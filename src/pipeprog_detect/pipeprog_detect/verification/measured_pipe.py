@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A candidate as the keyframes measured it, and collinear pieces joined to one pipe."""
 
 from __future__ import annotations

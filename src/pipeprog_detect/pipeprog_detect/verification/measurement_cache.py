@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measurements of the last map, which stand as long as nothing that they depend on has changed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether the radius that the cloud shows and the one that the keyframes show can be those of one pipe."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What surrounds a cylinder: a pipe is seen from outside, is not the rounding of a corner, and lies in no wall."""
 
 from __future__ import annotations

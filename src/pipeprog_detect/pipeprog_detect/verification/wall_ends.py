@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ends at walls, floors and ceilings: those that no keyframe shows, and those that lie behind the wall."""
 
 from __future__ import annotations

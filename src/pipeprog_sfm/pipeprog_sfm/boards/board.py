@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Boards, what an image shows of one, and which boards look the same."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A board's place in the model, adjusted on all of its images, and its errors with those of images and poses."""
 
 from __future__ import annotations

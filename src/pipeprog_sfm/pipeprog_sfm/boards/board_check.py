@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each circle of a placed board triangulated by itself, and compared with the board's file."""
 
 from __future__ import annotations

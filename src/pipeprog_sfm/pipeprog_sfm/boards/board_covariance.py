@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The errors of a board's images: of each circle by itself, and common to all circles of one image, by its pose."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Boards in one image: which ellipse is which circle of which board."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The board file: the boards and scale bars on a site, and distances measured between boards."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pose of a board from the ellipses of one image: from three of them, then refined on all.
 
 Poses are (4, 4) camera_from_board, m; `matrix` is the camera's (3, 3) K.

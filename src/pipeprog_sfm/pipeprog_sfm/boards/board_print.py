@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Boards as PDF pages to print at true size."""
 
 from __future__ import annotations

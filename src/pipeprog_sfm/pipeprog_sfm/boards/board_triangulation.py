@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Boards placed in the model: a similarity each, from images whose poses are known.
 
 The model is that of structure from motion, which is correct up to a similarity. Lengths are in the model's unit, and

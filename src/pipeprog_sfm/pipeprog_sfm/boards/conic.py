@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images of circles: conics, their centres, and the circles that they may be images of.
 
 A conic is a symmetric (3, 3) matrix C with x^T C x = 0 for image points x = (u, v, 1), its dual is C* ~ C^-1. An

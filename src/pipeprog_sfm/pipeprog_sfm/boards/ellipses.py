@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bright discs on dark ground, found in an image as ellipses with sub-pixel edges."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A board placed in the model, the images that show it, and their circles as rows of equations."""
 
 from __future__ import annotations

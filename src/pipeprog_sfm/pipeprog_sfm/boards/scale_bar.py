@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scale bars: two discs of one size, put up a measured distance apart.
 
 Discs have no layout that tells which ellipse shows which of them, so the views decide: two ellipses match when the

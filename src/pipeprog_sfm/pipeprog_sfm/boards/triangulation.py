@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Geometry of points and rays: where two rays meet, cross products as matrices."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense cloud of a stream of keyframes: which of them get a depth map; made and fused in a thread of its own."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense cloud: depth maps that agree with each other, merged in a voxel hash."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sub-pixel depth: small slanted patches, compared with all neighbours at once and moved until they match.
 
 Propagation of planes between pixels follows Bleyer, Rhemann and Rother, "PatchMatch stereo", 2011; the step to the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Dense depth to a pixel's accuracy: plane sweep over all neighbours, census cost, semi-global matching.
 
 Collins, "A space-sweep approach to true multi-image matching", 1996; Zabih and Woodfill, "Non-parametric local

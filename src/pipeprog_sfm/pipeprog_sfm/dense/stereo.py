@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depth maps of keyframes on the CPU: each keyframe is matched with a few neighbours of known pose."""
 
 from __future__ import annotations

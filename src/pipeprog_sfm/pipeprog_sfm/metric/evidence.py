@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All that tells the scale and the vertical of a model: what was seen, what a robot told, and the model's poses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The direction up, from an accelerometer beside the camera."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frame `map`: its origin at the board that was seen first, else at the first camera, and z up."""
 
 from __future__ import annotations

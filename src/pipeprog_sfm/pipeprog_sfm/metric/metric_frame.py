@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What makes a model metric: its scale and the frame `map`, from all sources of scale and of the vertical."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The metric evidence of a stream of keyframes: each image is measured once, the scale estimated at any poses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scale by odometry: displacements as the robot tells them, over those of the model."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scale by a camera rig: the baseline of two cameras as /tf_static has it, over that in the model."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scale of a model: measurements of it, and their weighted mean.
 
 Every source measures the scale by itself, with its own standard deviation, at the poses as they are. The errors of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sources of scale: boards, known distances, scale bars, camera rigs, odometry; each measures it on its own.
 
 A source is a function of the evidence. SOURCES lists those of pipeprog; a further one is added by handing

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A robot's motion: transforms between frames as odometry and TF tell them, and accelerations."""
 
 from __future__ import annotations

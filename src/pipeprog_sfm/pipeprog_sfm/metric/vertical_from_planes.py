@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The direction up from planes: floors and ceilings are horizontal, walls and columns vertical."""
 
 from __future__ import annotations

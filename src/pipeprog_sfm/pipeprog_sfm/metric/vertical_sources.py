@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sources of the vertical: an IMU, a board that hangs plumb, odometry's frame; failing these, floor and walls."""
 
 from __future__ import annotations

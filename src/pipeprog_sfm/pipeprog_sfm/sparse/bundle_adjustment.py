@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of calibrated views: Levenberg-Marquardt on the Schur complement of the points.
 
 Own code rather than the solver that pycolmap wraps: that one needs one Python object per observation, and its adjuster

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The one module that imports pycolmap, and the one place where the half pixel between ROS and COLMAP is crossed.
 
 ROS and OpenCV put pixel centres at integers, COLMAP puts the corner of the first pixel at zero.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Guided matching: a registered view is matched along epipolar segments with the views that see the same place."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A keyframe as the mapper keeps it: features, calibration, and how much of the image the features cover."""
 
 from __future__ import annotations

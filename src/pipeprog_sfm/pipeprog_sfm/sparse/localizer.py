@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where a keyframe is in a model, by its matches with some of the model's views."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Loop closure: where the camera sees a place again, the drift is distributed over the views in between."""
 
 from __future__ import annotations

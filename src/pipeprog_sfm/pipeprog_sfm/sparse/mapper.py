@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Streaming structure from motion: keyframes in, poses and points of one map out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Matches between two keyframes: over the whole image, or guided by known poses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of a sparse model, and the covariance of what follows from its poses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two models merged by a keyframe that can be located in both."""
 
 from __future__ import annotations

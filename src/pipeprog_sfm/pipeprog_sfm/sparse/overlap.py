@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Overlap of each keyframe with the map, Eq. 1 of the paper, reported when it changes."""
 
 from __future__ import annotations

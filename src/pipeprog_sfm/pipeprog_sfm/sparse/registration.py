@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Registration of a keyframe in a model: its pose from the map's points, its tracks, and the check of the pose."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Image retrieval: which of many keyframes show the same as a given one, by the number of matches."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sparse map: all keyframes, the models that hold some of them, and the model that is published."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A sparse model: views, points, and which feature sees which point, in flat arrays.
 
 Flat arrays instead of pycolmap's graph, observation manager and triangulator: these accept no match between images that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tracks in flat arrays, compiled: extended along matches, triangulated, filtered.
 
 A track is the point that features of several views see; the arrays are those of `model.SparseModel`.

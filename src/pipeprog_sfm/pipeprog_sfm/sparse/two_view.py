@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A new model, started from two keyframes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which connections are missing, over real DDS, with and without viewers that subscribe to the same topics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/pipes.schema.json against what is written, and against what must not be."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`pipeprog view` as its users meet it: a process that writes a file, or says why it cannot."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ends of a barrel: where the points end, before an elbow, across clamps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A hypothesis measured on a cloud that holds more than its pipe."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which cylinders are pieces of one pipe, which are elbows."""
 
 from __future__ import annotations

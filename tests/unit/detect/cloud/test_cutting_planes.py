@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's front end: planes that cut pipes, from the user or placed by themselves."""
 
 from __future__ import annotations

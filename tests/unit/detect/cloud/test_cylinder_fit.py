@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The cylinder fit against synthetic truth: wrong starts, noise along the ray, its sigma."""
 
 from __future__ import annotations

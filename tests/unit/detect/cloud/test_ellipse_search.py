@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ellipses of sections: the confocal distance, components, and what is found among stray points."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a map shows that the one before did not, and the detector that seeks only there."""
 
 from unittest.mock import patch

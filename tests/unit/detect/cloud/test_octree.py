@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The linear octree against brute force."""
 
 from __future__ import annotations

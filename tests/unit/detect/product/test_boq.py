@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bills of quantities: what is read, and what a wrong one is told."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Classes by fixed nominal radii: posterior, rejection, ambiguity, progress."""
 
 from __future__ import annotations

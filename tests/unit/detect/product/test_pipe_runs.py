@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs of pipes: what fittings connect, and the length of the centre line through them."""
 
 from __future__ import annotations

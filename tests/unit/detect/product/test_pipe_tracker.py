@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pipes keep their names while the map moves, grows and loses sight of some."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Refinement by outlines on ray-cast images: shadows, starts, occluders and empty walls."""
 
 from __future__ import annotations

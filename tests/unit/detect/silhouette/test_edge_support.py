@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Outlines that a cylinder shares with a pipe before it."""
 
 from __future__ import annotations

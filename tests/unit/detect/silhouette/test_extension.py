@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pipe of which a piece is known is followed in the images to its ends, and no farther."""
 
 from __future__ import annotations

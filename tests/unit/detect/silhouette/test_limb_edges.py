@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The limb operator on profiles whose edge is known."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Coarse depth images of a cloud: what stands before a surface hides it, the surface does not hide itself."""
 
 from __future__ import annotations

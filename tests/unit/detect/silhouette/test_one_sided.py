@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pipe of a rack whose one outline is behind its neighbour."""
 
 import numpy as np

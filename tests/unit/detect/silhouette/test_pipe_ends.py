@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ends of a pipe by its rims on ray-cast images."""
 
 from __future__ import annotations

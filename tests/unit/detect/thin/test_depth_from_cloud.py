@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thin pipes from where they are seen: pieces of one line, and the depth that the cloud gives it."""
 
 from __future__ import annotations

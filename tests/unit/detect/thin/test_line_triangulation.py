@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thin pipes by lines in the images: edges, segment_pairs, and what tells a pipe from a painted strip."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What runs parallel beside a pipe that was found by its lines tells its slope."""
 
 from __future__ import annotations

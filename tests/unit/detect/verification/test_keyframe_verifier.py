@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The keyframes as judges: which of them are asked."""
 
 from __future__ import annotations

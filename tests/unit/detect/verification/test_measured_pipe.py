@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pieces of one pipe are one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is remembered of a map while its keyframes stay where they were, and decoded keyframes within bounds."""
 
 from __future__ import annotations

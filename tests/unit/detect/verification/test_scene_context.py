@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cylinders beside and within walls that are known as points on a grid."""
 
 from __future__ import annotations

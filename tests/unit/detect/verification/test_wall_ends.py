@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ends of a pipe at a floor: shown, hidden, beyond it, or not there."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two discs and a tape measure: seen with and without a board and clutter, by poses up to a similarity."""
 
 from dataclasses import replace

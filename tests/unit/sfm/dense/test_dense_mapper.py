@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense mapper on a walk along a textured wall, in exact views."""
 
 from __future__ import annotations

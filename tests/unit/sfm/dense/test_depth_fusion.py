@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fusion of exact and spoilt depth maps of a wall with a pipe in front of it."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depth maps against a ray-cast wall with a pipe in front of it."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two cameras on one body: the scale by how far apart they are mounted."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odometry, TF and IMU: paths, scale and vertical."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of a synthetic scene."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """COLMAP models: written, and read back by COLMAP itself."""
 
 import cv2  # noqa: F401  # before pycolmap

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which views a view is matched with."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Loop closure on a chain of views: which views move, and how far."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mapper on a synthetic room corner: points with random descriptors, seen on a walk along it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Matching of random descriptors with a known permutation."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Models made one that share a keyframe."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Eq. 1 of the paper on a map that is known."""
 
 from __future__ import annotations

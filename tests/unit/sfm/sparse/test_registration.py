@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A third keyframe registered in a model of two."""
 
 from __future__ import annotations

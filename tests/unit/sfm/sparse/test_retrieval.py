@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keyframes that show the same, among others that do not."""
 
 from __future__ import annotations

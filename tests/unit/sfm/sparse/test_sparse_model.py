@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A sparse model of a synthetic scene: tracks, contradictions, what is dropped and taken over."""
 
 from __future__ import annotations
