@@ -50,7 +50,7 @@ class Search:
         radius_range: least and largest radius [m].
         planned_radii: those of the bill of quantities [m].
         config: the settings.
-        jury: the keyframes.
+        verifier: the keyframes.
         report: is told the share of the detection that is done (0..1), and what is being done.
     """
 

@@ -71,7 +71,7 @@ def _walk(cylinder: Cylinder | None, shadow_at: float, count: int = 8) -> list[V
 
 @pytest.fixture(scope="session")
 def pipe_views() -> list[View]:
-    """A walk past the pipe; the shadow's edge on the wall lies 5 mm beside the outline and is the stronger one."""
+    """A walk past the pipe; the shadow's edge on the wall lies 5 mm beside the contour and is the stronger one."""
     return _walk(PIPE, shadow_at=0.055)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The outline model against brute force: points all over a cylinder, projected one by one."""
+"""The contour model against brute force: points all over a cylinder, projected one by one."""
 
 from __future__ import annotations
 

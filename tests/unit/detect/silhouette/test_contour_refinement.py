@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement by outlines on ray-cast images: shadows, starts, occluders and empty walls."""
+"""Refinement by the apparent contour on ray-cast images: shadows, starts, occluders and empty walls."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_support_tells_a_pipe_from_a_guess(pipe_views: list[View], empty_views: 
     assert Scene.of(PIPE, empty_views, []).support().share < 0.2
 
 
-def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:
+def test_hidden_samples_are_left_out(pipe_views: list[View]) -> None:
     screen = Cylinder(np.array([-0.5, -0.3, 0.0]), np.array([0.5, -0.3, 0.0]), 0.05)
     fit = refine(Start(PIPE, 0.002), pipe_views, [screen])
     assert fit is not None
@@ -108,9 +108,9 @@ def test_hidden_outlines_are_left_out(pipe_views: list[View]) -> None:
 def test_no_radius_is_below_zero_where_edges_of_texture_pull_it(
     empty_views: list[View], pipe_views: list[View], radius_known: bool, aside: float, on_an_edge: bool | None
 ) -> None:
-    """A cylinder thinner than a pixel is measured on the pipe's outline (0.04 m aside), and nowhere on plain texture.
+    """A cylinder thinner than a pixel is measured on the pipe's contour (0.04 m aside), and nowhere on plain texture.
 
-    At 0.05 m, between the outline and the shadow's edge, it may take either or none.
+    At 0.05 m, between the contour and the shadow's edge, it may take either or none.
     """
     place = np.array([aside, 0.0, 0.1])
     for views in (empty_views, pipe_views):

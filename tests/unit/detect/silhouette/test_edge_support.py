@@ -23,7 +23,7 @@ def ghost_of(pipe: Cylinder, views: list[View]) -> Cylinder:
     return Cylinder(centre + grown * (pipe.start - centre), centre + grown * (pipe.end - centre), grown * pipe.radius)
 
 
-def test_a_ghost_behind_a_pipe_has_no_outlines_of_its_own(pipe_views: list[View]) -> None:
+def test_a_ghost_behind_a_pipe_has_no_contour_of_its_own(pipe_views: list[View]) -> None:
     views = pipe_views[2:6]
     ghost = ghost_of(PIPE, views)
     assert Scene.of(ghost, views, []).support().share > MIN_SUPPORT
@@ -31,14 +31,14 @@ def test_a_ghost_behind_a_pipe_has_no_outlines_of_its_own(pipe_views: list[View]
     assert own_contours([PIPE, ghost], views).tolist() == [True, False]
 
 
-def test_a_pipe_alone_keeps_its_outlines_and_what_never_had_any_is_not_judged_by_them(pipe_views: list[View]) -> None:
+def test_a_pipe_alone_keeps_its_contour_and_what_never_had_one_is_not_judged_by_it(pipe_views: list[View]) -> None:
     aside = np.array([0.2, 0.0, 0.0])
     nothing = Cylinder(PIPE.start + aside, PIPE.end + aside, PIPE.radius)
     assert Scene.of(nothing, pipe_views, []).support().share < MIN_SUPPORT
     assert own_contours([PIPE, nothing], pipe_views).tolist() == [True, True]
 
 
-def test_an_edge_that_is_one_outline_of_a_cylinder_is_not_both(pipe_views: list[View]) -> None:
+def test_an_edge_on_one_side_of_a_cylinder_is_not_both(pipe_views: list[View]) -> None:
     aside = np.array([1.5 * PIPE.radius, 0.0, 0.0])
     beside = Cylinder(PIPE.start + aside, PIPE.end + aside, 0.5 * PIPE.radius)
     seen = Scene.of(beside, pipe_views, []).support()
@@ -48,7 +48,7 @@ def test_an_edge_that_is_one_outline_of_a_cylinder_is_not_both(pipe_views: list[
 
 
 @pytest.mark.parametrize("views", [3, 4, 5, 8, 20])
-def test_few_views_of_a_real_outline_count_as_well_as_many(views: int) -> None:
+def test_few_views_of_a_real_contour_count_as_well_as_many(views: int) -> None:
     """Edges that are found at chance in each view: 7 of 10 on a pipe, 1 of 5 on what is none."""
     random = np.random.default_rng(views)
     seen = np.full((4000, 2), float(views))

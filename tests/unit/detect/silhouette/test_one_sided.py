@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A pipe of a rack whose one outline is behind its neighbour."""
+"""A pipe of a rack of which a neighbour hides one side."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from pipeprog_detect.silhouette.scene import Scene, frame, viewing_direction
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
-# Another pipe, which hides the outline of that of `pipe_views` towards +x from all of the walk.
+# Another pipe, which hides the side of that of `pipe_views` towards +x from all of the walk.
 NEIGHBOUR = Cylinder(np.array([0.1, -0.08, -0.5]), np.array([0.08, -0.08, 0.5]), 0.09)
 SEEN = SeenArc(np.radians(105.0), 1e-3)
 
@@ -20,12 +20,12 @@ def side_of_the_neighbour(views: list[View]) -> float:
     return float(np.sign(basis[0] @ (NEIGHBOUR.start - PIPE.start)))
 
 
-def test_the_outline_away_from_the_neighbour_is_the_only_one(pipe_views: list[View]) -> None:
+def test_the_side_away_from_the_neighbour_is_the_only_one(pipe_views: list[View]) -> None:
     assert only_visible_side(Scene.of(PIPE, pipe_views, [NEIGHBOUR])) == -side_of_the_neighbour(pipe_views)
     assert only_visible_side(Scene.of(PIPE, pipe_views, [])) is None
 
 
-def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View]) -> None:
+def test_a_gap_in_what_hides_a_side_does_not_show_it(pipe_views: list[View]) -> None:
     def up_to(height: float) -> Cylinder:
         share = (height - NEIGHBOUR.start[2]) / (NEIGHBOUR.end[2] - NEIGHBOUR.start[2])
         return Cylinder(NEIGHBOUR.start, NEIGHBOUR.start + share * (NEIGHBOUR.end - NEIGHBOUR.start), NEIGHBOUR.radius)
@@ -36,7 +36,7 @@ def test_a_gap_in_what_hides_an_outline_does_not_show_it(pipe_views: list[View])
     assert only_visible_side(Scene.of(PIPE, pipe_views, [half])) is None
 
 
-def test_one_outline_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
+def test_one_side_mends_what_the_cloud_has(pipe_views: list[View]) -> None:
     """A radius 4 mm too large whose surface lies where it was seen; to the cloud that is 1.6 sigma."""
     half = 0.5 * SEEN.arc
     middle = np.array([-side_of_the_neighbour(pipe_views) * np.cos(half), -np.sin(half)])

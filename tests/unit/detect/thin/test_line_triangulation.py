@@ -43,7 +43,7 @@ def test_pieces_of_one_edge_are_joined_and_a_blank_image_has_none() -> None:
     assert len(straight_edges(np.full((50, 50), 7, np.uint8))) == 0
 
 
-def test_a_pipe_is_proposed_where_its_outlines_agree(pipe_views: list[View]) -> None:
+def test_a_pipe_is_proposed_where_its_contour_lines_agree(pipe_views: list[View]) -> None:
     found = propose(pipe_views, cloud(PIPE), RADII, [], 5)
     assert found
     offset = found[0].middle - PIPE.start
@@ -60,7 +60,7 @@ def test_known_pipes_and_strips_on_the_wall_are_not_proposed(pipe_views: list[Vi
     assert propose([], cloud(), RADII, [], 5) == []
 
 
-def test_outlines_of_a_strip_stay_where_they_are(pipe_views: list[View]) -> None:
+def test_the_contour_of_a_strip_stays_where_it_is(pipe_views: list[View]) -> None:
     pipe = refine(Start(PIPE, 0.004), pipe_views, [])
     assert pipe is not None
     assert abs(pipe.flatness) < 0.3

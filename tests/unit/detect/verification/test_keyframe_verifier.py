@@ -17,8 +17,8 @@ from tests.unit.detect.straight_ahead import looking_along_y
 BOQ = BillOfQuantities((PipeClass("DN65", PIPE.radius, 3.0, (0.0, 0.0, 1.0), 4e-4),))
 
 
-def test_a_pipe_that_few_keyframes_of_many_show_is_vouched_for(pipe_views: list[View]) -> None:
-    """On a long walk every thirtieth part of the keyframes would show the pipe twice, and no outline in three."""
+def test_a_pipe_that_few_keyframes_of_many_show_is_verified(pipe_views: list[View]) -> None:
+    """On a long walk every thirtieth part of the keyframes would show the pipe twice, and no contour in three."""
     elsewhere = [looking_along_y(20.0 + number, 1000 + number) for number in range(200)]
     views = [view for number, view in enumerate(pipe_views) for view in [view, *elsewhere[25 * number :][:25]]]
     evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)

@@ -40,11 +40,11 @@ def upright(x: float, y: float, radius: float = RADIUS, low: float = 0.1, high: 
 
 
 @pytest.mark.parametrize("radius", [0.0086, 0.0365, 0.11])
-def test_a_pipe_that_touches_the_wall_is_not_buried(radius: float) -> None:
+def test_a_pipe_that_touches_the_wall_is_not_embedded(radius: float) -> None:
     assert not surroundings(BACK).is_embedded(upright(0.0, -radius, radius), 1e-4, AWAY)
 
 
-def test_a_pipe_whose_axis_lies_behind_the_wall_is_buried() -> None:
+def test_a_pipe_whose_axis_lies_behind_the_wall_is_embedded() -> None:
     assert surroundings(BACK).is_embedded(upright(0.0, 0.006), 1e-4, AWAY)
 
 
@@ -52,19 +52,19 @@ def test_a_radius_that_is_not_known_may_have_led_the_axis_behind_the_wall() -> N
     assert not surroundings(BACK).is_embedded(upright(0.0, 0.006), 4e-3, AWAY)
 
 
-def test_a_pipe_half_in_the_wall_is_buried_and_one_on_it_is_not() -> None:
+def test_a_pipe_half_in_the_wall_is_embedded_and_one_on_it_is_not() -> None:
     assert surroundings(BACK).is_embedded(upright(0.0, 0.0), 1e-4, AWAY)
     assert not surroundings(BACK).is_embedded(upright(0.0, -RADIUS), 1e-4, AWAY)
 
 
-def test_the_line_where_two_walls_meet_is_buried_and_a_pipe_before_it_is_not() -> None:
+def test_the_line_where_two_walls_meet_is_embedded_and_a_pipe_before_it_is_not() -> None:
     corner = surroundings(BACK, SIDE)
     aslant = np.array([-0.3, 1.0, 0.0])
     assert corner.is_embedded(upright(-0.507, 0.006), 1e-4, aslant)
     assert not corner.is_embedded(upright(-0.5 + RADIUS, -RADIUS), 1e-4, aslant)
 
 
-def test_a_wall_on_one_side_hides_one_outline_only() -> None:
+def test_a_wall_on_one_side_hides_one_side_only() -> None:
     beside = wall([0.01, -0.2, 0.0], [0.5, -0.2, 1.0])
     assert not surroundings(beside).is_embedded(upright(-0.01, 0.0), 1e-4, AWAY)
 
@@ -75,5 +75,5 @@ def test_a_pipe_that_leaves_the_wall_for_most_of_its_length_stands() -> None:
     assert surroundings(low, high).is_embedded(upright(0.0, -RADIUS, high=0.6), 1e-4, AWAY)
 
 
-def test_without_walls_nothing_is_buried() -> None:
+def test_without_walls_nothing_is_embedded() -> None:
     assert not surroundings().is_embedded(upright(0.0, 0.0), 1e-4, AWAY)
