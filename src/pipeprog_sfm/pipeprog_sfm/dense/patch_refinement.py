@@ -17,6 +17,7 @@ PLANE_RADIUS = 2  # grid pixels around one whose inverse depths give its slant
 SAME_SURFACE = 0.01  # relative difference of depth up to which neighbouring pixels lie on one surface
 CORRELATION_MIN = 0.3  # below, a view does not see the patch
 STEP_MAX = 0.004  # of the depth: linearisation of an image holds for about a pixel
+SAME_PLANE = 0.0007  # of the depth, a fifth of STEP_MAX: Gauss-Newton takes planes this near to the same depth
 GAIN_MIN, GAIN_MAX = 0.7, 1.4  # of one view's contrast over another's: exposure, viewing angle
 NOISE = 0.7  # [grey levels] of two 8-bit images' difference at best
 FLATNESS = 2e-4  # of the depth: how far a pipe of 50 mm bulges over the plane's 9 px at 2 m, 0.4 mm
@@ -124,12 +125,8 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
             for k in range(SIZE):
                 patch[k] -= mean
                 energy += patch[k] * patch[k]
-            best_depth, best, best_step, best_sigma = (
-                np.float32(0.0),
-                np.float32(-2.0),
-                np.float32(0.0),
-                np.float32(0.0),
-            )
+            best_depth = best_step = best_sigma = np.float32(0.0)
+            best = np.float32(-2.0)
             for candidate in range(5 if distance > 0 else 1):
                 i, j = row, column
                 if candidate == 1:
@@ -144,24 +141,12 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
                     continue
                 su, sv = slant[i, j, 0], slant[i, j, 1]
                 depth = inverse_depth[i, j] + (su * (column - j) + sv * (row - i)) * stride
-                if candidate > 0 and abs(depth - best_depth) < np.float32(0.0007) * depth:
-                    continue  # the same plane for all that one step can tell
+                if candidate > 0 and abs(depth - best_depth) < np.float32(SAME_PLANE) * depth:
+                    continue
                 score, step, sigma = _match(
-                    patch,
-                    energy,
-                    neighbours,
-                    homographies,
-                    epipoles,
-                    u,
-                    v,
-                    depth,
-                    su,
-                    sv,
-                    better_half,
-                    warped,
-                    change,
-                    scores,
-                )
+                    patch, energy, neighbours, homographies, epipoles,
+                    u, v, depth, su, sv, better_half, warped, change, scores,
+                )  # fmt: skip
                 if score > best:
                     best_depth, best, best_step, best_sigma = depth, score, step, sigma
             if best_sigma > 0.0:
@@ -228,15 +213,22 @@ def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, s
         curvature += gain * gain * cc
         residual += energy - np.float32(2.0) * gain * wp + gain * gain * ww
         used += 1
+    total = _sum_of_best(scores, better_half)
+    if used == 0 or not curvature > 0.0:
+        return np.float32(-1.0), np.float32(0.0), np.float32(0.0)
+    variance = max(residual, np.float32(0.0)) / np.float32(used * SIZE) + np.float32(NOISE * NOISE)
+    return total / np.float32(better_half), gradient / curvature, np.sqrt(variance / curvature)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+def _sum_of_best(scores, count):  # type: ignore[no-untyped-def]
+    """Sum of the `count` highest scores, which are overwritten."""
     total = np.float32(0.0)
-    for _ in range(better_half):
+    for _ in range(count):
         top_view = 0
         for n in range(1, len(scores)):
             if scores[n] > scores[top_view]:
                 top_view = n
         total += scores[top_view]
         scores[top_view] = -2.0
-    if used == 0 or not curvature > 0.0:
-        return np.float32(-1.0), np.float32(0.0), np.float32(0.0)
-    variance = max(residual, np.float32(0.0)) / np.float32(used * SIZE) + np.float32(NOISE * NOISE)
-    return total / np.float32(better_half), gradient / curvature, np.sqrt(variance / curvature)
+    return total

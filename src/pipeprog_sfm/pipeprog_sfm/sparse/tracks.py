@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tracks in flat arrays, compiled: extended along matches, triangulated, filtered.
 
-A track is the point that features of several views see; the arrays are those of `model.SparseModel`.
+A track is the point that features of several views see; the arrays are those of `SparseModel`.
 """
 
 from __future__ import annotations
@@ -82,6 +82,60 @@ def extend(  # type: ignore[no-untyped-def]  # compiled
 
 
 @njit(cache=True, nogil=True)
+def _view_rays(track, view_of, rays, rotation, translation):  # type: ignore[no-untyped-def]  # compiled
+    """(N, 3) unit directions of a track's features in the model, and (N, 3) centres of their views."""
+    directions = np.empty((len(track), 3))
+    centres = np.empty((len(track), 3))
+    for k in range(len(track)):
+        view = view_of[track[k]]
+        u, v = rays[track[k], 0], rays[track[k], 1]
+        norm = np.sqrt(u * u + v * v + 1)
+        for i in range(3):
+            r = rotation[view]
+            directions[k, i] = (r[0, i] * u + r[1, i] * v + r[2, i]) / norm
+            centres[k, i] = -(
+                r[0, i] * translation[view, 0] + r[1, i] * translation[view, 1] + r[2, i] * translation[view, 2]
+            )
+    return directions, centres
+
+
+@njit(cache=True, nogil=True)
+def _widest_pair(directions, among):  # type: ignore[no-untyped-def]  # compiled
+    """Cosine between the two directions of `among` (N,) bool that are farthest apart (2.0: fewer than two), and both."""
+    widest, first, second = 2.0, -1, -1
+    for k in range(len(directions)):
+        if not among[k]:
+            continue
+        for m in range(k + 1, len(directions)):
+            if not among[m]:
+                continue
+            cosine = (
+                directions[k, 0] * directions[m, 0]
+                + directions[k, 1] * directions[m, 1]
+                + directions[k, 2] * directions[m, 2]
+            )
+            if cosine < widest:
+                widest, first, second = cosine, k, m
+    return widest, first, second
+
+
+@njit(cache=True, nogil=True)
+def _nearest_point(directions, centres, chosen):  # type: ignore[no-untyped-def]  # compiled
+    """The point with the least sum of squared distances from the chosen rays."""
+    normal = np.zeros((3, 3))
+    right = np.zeros(3)
+    for k in range(len(directions)):
+        if not chosen[k]:
+            continue
+        for i in range(3):
+            for j in range(3):
+                projector = (1.0 if i == j else 0.0) - directions[k, i] * directions[k, j]
+                normal[i, j] += projector
+                right[i] += projector * centres[k, j]
+    return np.linalg.solve(normal, right)
+
+
+@njit(cache=True, nogil=True)
 def triangulate(  # type: ignore[no-untyped-def]  # compiled
     features, others, point_of, view_of, rays, next_point, rotation, translation, focal, max_error, max_cosine
 ):
@@ -98,79 +152,32 @@ def triangulate(  # type: ignore[no-untyped-def]  # compiled
         track[0] = features[begin]
         track[1:] = others[begin:end]
         begin = end
-        directions = np.empty((size, 3))
-        centres = np.empty((size, 3))
-        for k in range(size):
-            view = view_of[track[k]]
-            u, v = rays[track[k], 0], rays[track[k], 1]
-            norm = np.sqrt(u * u + v * v + 1)
-            for i in range(3):
-                r = rotation[view]
-                directions[k, i] = (r[0, i] * u + r[1, i] * v + r[2, i]) / norm
-                centres[k, i] = -(
-                    r[0, i] * translation[view, 0] + r[1, i] * translation[view, 1] + r[2, i] * translation[view, 2]
-                )
-        # The widest pair fixes the point; all that agree with it refine it.
-        widest, first, second = 2.0, -1, -1
-        for k in range(size):
-            for m in range(k + 1, size):
-                cosine = (
-                    directions[k, 0] * directions[m, 0]
-                    + directions[k, 1] * directions[m, 1]
-                    + directions[k, 2] * directions[m, 2]
-                )
-                if cosine < widest:
-                    widest, first, second = cosine, k, m
+        directions, centres = _view_rays(track, view_of, rays, rotation, translation)
+        widest, first, second = _widest_pair(directions, np.ones(size, np.bool_))
         if widest > max_cosine:
             continue
+        # The widest pair fixes the point; all that agree with it refine it.
         chosen = np.zeros(size, np.bool_)
         chosen[first] = chosen[second] = True
         point = np.zeros(3)
-        agreeing = 0
         for _ in range(2):
-            normal = np.zeros((3, 3))
-            right = np.zeros(3)
-            for k in range(size):
-                if not chosen[k]:
-                    continue
-                for i in range(3):
-                    for j in range(3):
-                        projector = (1.0 if i == j else 0.0) - directions[k, i] * directions[k, j]
-                        normal[i, j] += projector
-                        right[i] += projector * centres[k, j]
-            point[:] = np.linalg.solve(normal, right)
-            agreeing = 0
+            point[:] = _nearest_point(directions, centres, chosen)
             for k in range(size):
                 view = view_of[track[k]]
-                chosen[k] = (
-                    _error(
-                        rotation[view], translation[view], focal[view],
-                        point[0], point[1], point[2], rays[track[k], 0], rays[track[k], 1],
-                    )
-                    < max_error
+                error = _error(
+                    rotation[view], translation[view], focal[view],
+                    point[0], point[1], point[2], rays[track[k], 0], rays[track[k], 1],
                 )  # fmt: skip
-                agreeing += chosen[k]
-            if agreeing < 2:
+                chosen[k] = error < max_error
+            if chosen.sum() < 2:
                 break
-        if agreeing < 2 or not chosen[0]:
+        if chosen.sum() < 2 or not chosen[0]:
             continue
-        free = 0
-        narrow = 2.0
-        for k in range(size):
-            if chosen[k] and point_of[track[k]] < 0:
-                free += 1
-                for m in range(k):
-                    if chosen[m] and point_of[track[m]] < 0:
-                        narrow = min(
-                            narrow,
-                            directions[k, 0] * directions[m, 0]
-                            + directions[k, 1] * directions[m, 1]
-                            + directions[k, 2] * directions[m, 2],
-                        )
-        if free < 2 or narrow > max_cosine:
+        free = chosen & (point_of[track] < 0)
+        if free.sum() < 2 or _widest_pair(directions, free)[0] > max_cosine:
             continue
         for k in range(size):
-            if chosen[k] and point_of[track[k]] < 0:
+            if free[k]:
                 point_of[track[k]] = next_point + count
         created[count] = point
         count += 1
