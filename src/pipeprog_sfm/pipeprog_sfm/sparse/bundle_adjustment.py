@@ -145,7 +145,11 @@ def function_covariance(gradients: FloatArray, bundle: Bundle, *, loss_scale: fl
 
 
 def rotation_from_vector(vectors: FloatArray) -> FloatArray:
-    """(N, 3) rotation vectors in radians -> (N, 3, 3) matrices (Rodrigues)."""
+    """(N, 3) rotation vectors in radians -> (N, 3, 3) matrices (Rodrigues).
+
+    SciPy's Rotation.from_rotvec differs by 2e-16, and by 9e-10 in the poses of a whole recording, so that the bytes of
+    its results would change for nothing: kept until something else changes them.
+    """
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
     x, y, z = vectors.T
     zero = np.zeros_like(x)
