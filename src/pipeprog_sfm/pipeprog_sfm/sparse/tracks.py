@@ -101,7 +101,7 @@ def _view_rays(track, view_of, rays, rotation, translation):  # type: ignore[no-
 
 @njit(cache=True, nogil=True)
 def _widest_pair(directions, among):  # type: ignore[no-untyped-def]  # compiled
-    """Cosine between the two directions of `among` (N,) bool that are farthest apart (2.0: fewer than two), and both."""
+    """Cosine between the two directions of `among` (N,) bool farthest apart (2.0: fewer than two), and indices."""
     widest, first, second = 2.0, -1, -1
     for k in range(len(directions)):
         if not among[k]:
