@@ -52,11 +52,12 @@ def jpeg(number: int) -> bytes:
     return cv2.imencode(".jpg", pixels)[1].tobytes()
 
 
-def write_bag(path: Path, frames: int = 23, damaged: int | None = None, motion: int = 0) -> Path:
+def write_bag(path: Path, frames: int = 23, damaged: int | None = None, motion: int = 0, odometries: int = 1) -> Path:
     with path.open("wb") as stream, BagWriter(stream) as writer:
         for number in range(motion):
             stamp = START + number * 10_000_000
-            writer.write("/odom", cdr.ODOMETRY, serialize_message(Odometry()), stamp)
+            for topic in ("/odom", "/visual_odom")[:odometries]:
+                writer.write(topic, cdr.ODOMETRY, serialize_message(Odometry()), stamp)
             writer.write("/imu", cdr.IMU, serialize_message(Imu())[: 40 if number == 7 else None], stamp)
         if motion:
             transforms = TFMessage(transforms=[TransformStamped(), TransformStamped()])
@@ -152,6 +153,16 @@ def test_what_a_robot_tells_of_its_motion_reaches_the_sfm(tmp_path: Path) -> Non
     assert "several topics" not in errors
     motion = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())["replay"]["motion_topics"]
     assert motion == {"/odom": "odometry", "/imu": "imu", "/tf_static": "/tf_static"}
+
+
+def test_motion_that_is_not_used_is_told(tmp_path: Path) -> None:
+    process = start(tmp_path, motion=3, odometries=2)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "several topics of nav_msgs/msg/Odometry, and none is used" in errors
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert len(run["notes"]) == 1
+    assert run["losses"] == []
 
 
 @pytest.mark.parametrize("node", ["frames", "sfm", "detect"])

@@ -44,7 +44,7 @@ ARGUMENTS = [
         "camera is mounted.",
     ),
     DeclareLaunchArgument(
-        "imu", default_value="imu", description="Topic of the robot's IMU, sensor_msgs/Imu: it tells what is up."
+        "imu", default_value="imu", description="Topic of the robot's IMU, sensor_msgs/Imu: it gives the vertical."
     ),
     DeclareLaunchArgument(
         "image_transport",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `pipeprog`.
 
-Whatever takes long to import is imported inside the commands, so that --help answers at once.
+Modules that take long to import are imported inside the commands, so that --help answers at once.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ def replay(
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", help="Play at R times real time; as fast as it goes without.", metavar="R"),
+        typer.Option("--rate", help="Play at R times real time; without, as fast as the nodes take it.", metavar="R"),
     ] = None,
     overrides: Set = None,
     force: Force = False,
-    image_topic: Annotated[str | None, typer.Option(help="Which camera, where there are several.")] = None,
-    camera_info_topic: Annotated[str | None, typer.Option(help="Its calibration.")] = None,
-    odometry_topic: Annotated[str | None, typer.Option(help="Which odometry, where there are several.")] = None,
-    imu_topic: Annotated[str | None, typer.Option(help="Which IMU, where there are several.")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Image topic, where there are several cameras.")] = None,
+    camera_info_topic: Annotated[str | None, typer.Option(help="CameraInfo topic of that camera.")] = None,
+    odometry_topic: Annotated[str | None, typer.Option(help="Odometry topic, where there are several.")] = None,
+    imu_topic: Annotated[str | None, typer.Option(help="IMU topic, where there are several.")] = None,
 ) -> None:
     """Run the node graph on a recording: keyframes, metric map, classified pipes, progress."""
     from pipeprog_bringup.playback.node_processes import require_ros
@@ -84,8 +84,8 @@ def replay(
     )
     with replay_bars() as report:
         outcome = run(request, report)
-    for loss in outcome.losses:
-        _note(loss)
+    for note in outcome.notes + outcome.losses:
+        _note(note)
     print_progress(outcome.product)
     typer.echo(
         f"{outcome.frames} frames considered, {outcome.registered} of {outcome.keyframes} keyframes registered, "

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 
 def output_console() -> Console:
-    """Where tables go; into a file or a pipe they are as wide as they need to be."""
+    """The console for tables: as wide as the terminal, 120 columns where stdout is a file or a pipe."""
     return Console(width=None if sys.stdout.isatty() else 120)
 
 
 def progress_display() -> Progress:
-    """Bars with their stage, share and time; nothing but the last state where stderr is no terminal."""
+    """Bars with stage, share and time on stderr; only the last state where stderr is no terminal."""
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -66,7 +66,7 @@ def replay_bars() -> Iterator[Callable[[State], None]]:
 
 
 def print_progress(product: Product) -> None:
-    """Planned and installed metres of each class, and what belongs to none."""
+    """Planned and installed metres of each class; a last row for the pipes of no planned class."""
     table = Table(title="Progress", title_justify="left")
     table.add_column("class")
     for name in ("outer radius [mm]", "pipes", "installed [m]", "planned [m]", "%"):

@@ -21,13 +21,13 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 
 FRAME_ID = "camera_optical_frame"
-# The first image's stamp: a video knows no clock, and zero means "not set" in ROS.
+# Stamp of the first image [ns]: a video has no clock, and zero means "not set" in ROS.
 START = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class Ingested:
-    """What became of a video: frames written, seconds they span, and what the user should know."""
+    """The result of `ingest`: frames written, seconds they span, and notes for the user."""
 
     frames: int
     seconds: float
@@ -63,7 +63,7 @@ def ingest(
                 raise InputError(f"{video} holds no frame that can be decoded: convert it to H.264 in an .mp4 file")
     finally:
         capture.release()
-    # Containers count the last few frames generously; more than that is a video cut short.
+    # Containers overstate the number of frames by one or two; where more are missing, the video was cut off.
     if count < 0.98 * expected - 2:
         notes.append(f"{video} ends early: {count} of {expected} frames could be read")
     return Ingested(count, (stamp - START) * 1e-9, notes)
@@ -95,7 +95,7 @@ def read_camera(path: Path) -> Camera:
 def _open(video: Path) -> Any:
     if not video.is_file():
         raise InputError(f"no such video: {video}")
-    # What FFmpeg itself would say on stderr, the errors here say in the user's terms.
+    # FFmpeg's own messages on stderr are switched off: the errors below say the same, with a remedy.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     capture = cv2.VideoCapture(str(video))
     if not capture.isOpened():
@@ -106,13 +106,13 @@ def _open(video: Path) -> Any:
 def _fit(capture: Any, calibrated: Camera, video: Path, camera_yaml: Path) -> tuple[Camera, list[str]]:
     """The camera of the frames, and whether they are taken as the sensor saw them or upright as players show them.
 
-    A phone writes the sensor's frames and a rotation. Mostly the sensor was calibrated; who calibrated by upright
-    frames has their size in the calibration.
+    A phone writes the sensor's frames and a rotation. A calibration of upright frames has their size, any other that
+    of the sensor.
     """
     width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     turned = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 != 0
     upright = bool(capture.get(cv2.CAP_PROP_ORIENTATION_AUTO))
-    # OpenCV gives the size of the frames that it will return.
+    # OpenCV gives the size of the frames that it will return, which are upright if `upright`.
     sensor = (height, width) if turned and upright else (width, height)
     sizes = {False: sensor, True: sensor[::-1] if turned else sensor}
     for is_upright, size in sizes.items():

@@ -13,15 +13,15 @@ from pipeprog_bringup.results.result_files import read_trajectory
 from pipeprog_camera.errors import InputError
 
 _DRAWN = re.compile(r"\s*(\d+)\s*:(.*)")
-_SHORTEST = 10.0  # px: a shorter line does not tell its direction to a degree
+_SHORTEST = 10.0  # px: at this length, one end drawn half a pixel off turns the plane by 3 degrees
 
 
 def as_points(planes: str, run: Path) -> str:
     """The setting `detect.plane` for planes parted by semicolons, of which some may be lines `KEYFRAME:u1,v1,u2,v2`.
 
     KEYFRAME counts the lines of `trajectory.tum` in the folder `run` of a finished survey from 1, pixels are those of
-    its image. Three points of each drawn plane take the line's place: the camera's centre and a metre along each ray.
-    Raises InputError where such a line is none or lies outside the image, or where the folder holds no survey.
+    its image. Three points of each drawn plane replace the line: the camera's centre and a metre along each ray.
+    Raises InputError where a line cannot be read or lies outside the image, or where the folder holds no survey.
     """
     parts = ((plane, _DRAWN.fullmatch(plane)) for plane in planes.split(";"))
     return ";".join(_points(plane.strip(), int(drawn[1]), drawn[2], run) if drawn else plane for plane, drawn in parts)

@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
@@ -23,7 +24,7 @@ from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.product.boq import load_boq
+from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.product import Product
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
@@ -47,13 +48,24 @@ class Request:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a replay has found."""
+    """The result of a replay; `notes` and `losses` are sentences for the user on the recording."""
 
     product: Product
     frames: int
     keyframes: int
     registered: int
+    notes: list[str]
     losses: list[str]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Inputs:
+    """What a request names, read and checked."""
+
+    bag: Bag
+    boq: BillOfQuantities
+    board_file: BoardFile
+    configs: dict[str, Any]  # settings of each node
 
 
 def replay(request: Request, report: Callable[[State], None], modules: dict[str, str] = NODE_MODULES) -> Outcome:
@@ -62,6 +74,32 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     Raises InputError for what the user can mend and NodeFailure when a node dies, hangs or fails; either leaves no
     process and no file behind.
     """
+    inputs = _read(request)
+    with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
+        parameters = _parameters(request, inputs.configs, folder.file("colmap"))
+        session = Session(inputs.bag, request.rate, report)
+        with private_domain(scratch), Graph(parameters, scratch, modules) as graph, _ros():
+            survey, status = session.run(graph)
+        with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
+            record_survey(recording, survey, status)
+            record_keyframes(recording, inputs.bag, session.log)
+        started = time.monotonic()
+        outcome = Outcome(
+            product=write_survey(folder, survey, session.log),
+            frames=session.log.considered,
+            keyframes=session.log.chosen,
+            registered=status.keyframes_registered,
+            notes=inputs.bag.notes,
+            losses=inputs.bag.losses + session.log.faults(),
+        )
+        result_files.write_config(folder.file("config.yaml"), _settings(request, inputs))
+        timings = {**session.timings, "write": time.monotonic() - started}
+        result_files.write_run(folder, _facts(request, inputs, outcome, timings))
+    return outcome
+
+
+def _read(request: Request) -> _Inputs:
+    """Read what the request names; raises InputError where something of it cannot be used."""
     bag = Bag.open(
         request.bag, request.image_topic, request.camera_info_topic, request.odometry_topic, request.imu_topic
     )
@@ -73,55 +111,53 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
         raise InputError("--set frames.lockstep: a replay is always in lockstep, or it would lose frames")
     configs = effective(request.overrides)
     configs["frames"] = dataclasses.replace(configs["frames"], lockstep=True)
+    return _Inputs(bag, boq, board_file, configs)
+
+
+def _parameters(request: Request, configs: dict[str, Any], colmap: Path) -> dict[str, dict[str, Any]]:
+    """The ROS parameters of each node: its settings, and the files that it reads or writes."""
     parameters = as_parameters(configs)
-    parameters["sfm"]["lockstep"] = True
-    parameters["sfm"]["board"] = str(request.board.resolve()) if request.board else ""
+    board = str(request.board.resolve()) if request.board else ""
+    parameters["sfm"] |= {"lockstep": True, "board": board, "colmap": str(colmap.resolve())}
     parameters["detect"] |= {"boq": str(request.boq.resolve()), "intermediate": False}
-    with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
-        parameters["sfm"]["colmap"] = str(folder.file("colmap").resolve())
-        session = Session(bag, request.rate, report)
-        with private_domain(scratch), Graph(parameters, scratch, modules) as graph, _ros():
-            survey, status = session.run(graph)
-        with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
-            record_survey(recording, survey, status)
-            record_keyframes(recording, bag, session.log)
-        started = time.monotonic()
-        product = write_survey(folder, survey, session.log)
-        result_files.write_config(
-            folder.file("config.yaml"),
-            {
-                **{node: dataclasses.asdict(config) for node, config in configs.items()},
-                "boq": result_files.boq_entries(boq),
-                "boards": [board.name for board in board_file.boards],
-                "replay": {
-                    "bag": str(request.bag),
-                    "image_topic": bag.image_topic,
-                    "camera_info_topic": bag.camera_info_topic,
-                    "motion_topics": bag.motion_topics,
-                    "rate": request.rate,
-                },
-            },
-        )
-        losses = bag.losses + session.log.faults()
-        facts = {
-            "command": "replay",
-            "bag": str(request.bag.resolve()),
-            "frames_in_bag": bag.image_count,
-            "frames_considered": session.log.considered,
-            "keyframes": session.log.chosen,
-            "registered": status.keyframes_registered,
-            "losses": losses,
-            "seeds": {node: config.seed for node, config in configs.items() if hasattr(config, "seed")},
-            "timings_s": {**session.timings, "write": time.monotonic() - started},
-        }
-        result_files.write_run(folder, facts)
-    registered = status.keyframes_registered
-    return Outcome(product, session.log.considered, session.log.chosen, registered, losses)
+    return parameters
+
+
+def _settings(request: Request, inputs: _Inputs) -> dict[str, Any]:
+    """The content of config.yaml."""
+    return {
+        **{node: dataclasses.asdict(config) for node, config in inputs.configs.items()},
+        "boq": result_files.boq_entries(inputs.boq),
+        "boards": [board.name for board in inputs.board_file.boards],
+        "replay": {
+            "bag": str(request.bag),
+            "image_topic": inputs.bag.image_topic,
+            "camera_info_topic": inputs.bag.camera_info_topic,
+            "motion_topics": inputs.bag.motion_topics,
+            "rate": request.rate,
+        },
+    }
+
+
+def _facts(request: Request, inputs: _Inputs, outcome: Outcome, timings: dict[str, float]) -> dict[str, Any]:
+    """What run.json holds of this run, besides versions and files."""
+    return {
+        "command": "replay",
+        "bag": str(request.bag.resolve()),
+        "frames_in_bag": inputs.bag.image_count,
+        "frames_considered": outcome.frames,
+        "keyframes": outcome.keyframes,
+        "registered": outcome.registered,
+        "notes": outcome.notes,
+        "losses": outcome.losses,
+        "seeds": {node: config.seed for node, config in inputs.configs.items() if hasattr(config, "seed")},
+        "timings_s": timings,
+    }
 
 
 @contextlib.contextmanager
 def _scratch() -> Iterator[Path]:
-    """A folder for parameter files and logs, gone with the replay; kept where a node failed and its log says why."""
+    """A folder for parameter files and logs, removed at the end; kept where a node failed, for its log."""
     path = Path(tempfile.mkdtemp(prefix="pipeprog-"))
     try:
         yield path

@@ -14,13 +14,13 @@ PERIOD = 1.0  # [s]
 
 
 class Diagnostics:
-    """Publishes what `health` says: (level, message, values), the level one of DiagnosticStatus.OK, WARN, ERROR."""
+    """Publishes what `health` returns: (level, message, values), the level one of DiagnosticStatus.OK, WARN, ERROR."""
 
     def __init__(self, node: Node, name: str, health: Callable[[], tuple[bytes, str, Mapping[str, Any]]]) -> None:
         self._node, self._health = node, health
         self._name = f"{node.get_fully_qualified_name().lstrip('/')}: {name}"
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # Wall time: a paused recording stops ROS time, and that is when one looks at the diagnostics.
+        # Steady time: a paused recording stops ROS time, and the diagnostics must go on.
         self._timer = node.create_timer(PERIOD, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _publish(self) -> None:

@@ -15,11 +15,11 @@ from rclpy.signals import SignalHandlerOptions
 
 from pipeprog_camera.errors import InputError
 
-STOP_LATENCY = 0.1  # [s] a node without work looks this often whether it was told to stop
+STOP_LATENCY = 0.1  # [s] at most from a signal to the end of a node to which no message comes
 
 
 def run(node_type: Callable[[], Node]) -> None:
-    """Runs the node until it is told to stop.
+    """Runs the node until SIGINT or SIGTERM.
 
     The process exits with 0 after SIGINT or SIGTERM, and with 1 and one line on stderr after an InputError.
     """

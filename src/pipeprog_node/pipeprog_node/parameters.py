@@ -32,7 +32,7 @@ def declare(node: Node, config_type: type[Config], extra: Collection[str] = ()) 
     Parameters given by a file or the command line that are neither a setting nor in `extra` (those that the node
     declares itself) are an InputError that names the nearest known one; so are values of a wrong type or out of range.
     """
-    # rclpy offers no public way to the overrides, and it ignores without a word those that nobody declares.
+    # rclpy gives no public access to the overrides, and silently ignores those that are not declared.
     overrides: dict[str, Parameter] = node._parameter_overrides
     settings = {setting.name: setting for setting in describe(config_type)}
     values: dict[str, object] = {}

@@ -15,7 +15,7 @@ OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 
 
 def sensor(depth: int) -> QoSProfile:
-    """Live images: fits every publisher, and a late image is worth less than the next one."""
+    """Live images: best effort connects to publishers of every kind, and the next image replaces a lost one."""
     return QoSProfile(depth=depth, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 
 
@@ -25,7 +25,7 @@ def reliable(depth: int) -> QoSProfile:
 
 
 def kept(depth: int) -> QoSProfile:
-    """As `reliable`, and those who find the publisher late still get its last messages."""
+    """As `reliable`, and a subscriber that comes late still gets the last messages."""
     return QoSProfile(
         depth=depth, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
     )

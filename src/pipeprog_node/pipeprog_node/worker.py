@@ -77,7 +77,7 @@ class WorkerProcess:
             try:
                 self._connection.send(command)
             except OSError:
-                return  # the reader tells of the death
+                return  # _read reports the death
             with self._ready:
                 self._outbox.popleft()
 

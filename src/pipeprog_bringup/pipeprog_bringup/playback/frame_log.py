@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of each frame of a replay: which are still on their way, and why each was chosen or not."""
+"""The state of each frame of a replay: sent and not decided on yet, or chosen or not and why."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from pipeprog_bringup.results.result_files import FrameRow
 
-FAULTS = ("damaged", "stamp")  # how the reasons begin that lie in the recording, not in what it shows
+FAULTS = ("damaged", "stamp")  # beginnings of reasons that are faults of the recording itself
 
 
 class FrameLog:
@@ -42,11 +42,11 @@ class FrameLog:
         self._rows.append(None)
 
     def skip(self, stamp: int, reason: str) -> None:
-        """A frame could not even be sent."""
+        """A frame was not sent, for this reason."""
         self._rows.append(FrameRow(stamp, False, reason))
 
     def decide(self, row: FrameRow) -> None:
-        """A decision came; a second one about a frame revokes the first."""
+        """A decision came; a second one about the same frame replaces the first."""
         waiting = self._pending.get(row.stamp)
         if waiting:
             self._rows[waiting.popleft()] = row
@@ -56,7 +56,7 @@ class FrameLog:
             self._rows[self._first[row.stamp]] = row
 
     def overlap(self, stamp: int, overlap: float, cell_overlap: float, tie_points: int, registered: bool) -> None:
-        """The SfM measured how well a keyframe is tied into the model (Ov_N, Eq. 1 of the paper; the same in cells)."""
+        """The SfM reported the overlap of a keyframe: Ov_N (Eq. 1), and the share of the image's cells."""
         self._overlap[stamp] = overlap, cell_overlap, tie_points, registered
 
     def rows(self) -> list[FrameRow]:
@@ -78,7 +78,7 @@ class FrameLog:
         return "; ".join(f"{count} x {reason}" for reason, count in self._reasons().most_common(3))
 
     def faults(self) -> list[str]:
-        """What is wrong with the recording's frames, one sentence each."""
+        """The faults of the recording's frames, one sentence each."""
         reasons = self._reasons()
         return [
             f"{reasons[reason]} frames left out: {reason}" for reason in sorted(reasons) if reason.startswith(FAULTS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three nodes as processes of one replay: started together, watched, and never left behind."""
+"""The three nodes as processes of one replay: started, watched and ended together."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NODE_MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "d
 _STOP_SECONDS = 3.0
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None) if os.name == "posix" else None  # no graph runs elsewhere, but the command loads
-# Domains whose ports stay below the range that Linux hands out to other programs.
+# Domain 101 would use ports from 7400 + 250 * 101 = 32650 on; Linux gives those from 32768 on to other programs.
 _DOMAINS = range(1, 101)
 
 
@@ -49,7 +49,7 @@ def require_ros() -> None:
 
 
 class Graph:
-    """Context in which the nodes run; they and all that they started are gone when it ends.
+    """Context in which the nodes run; at its end they and their child processes are ended.
 
     `parameters` are flat ROS parameters per node; `folder` takes the parameter files and the nodes' output. Each node
     leads a process group of its own, so that Ctrl-C reaches only the command, which then ends the nodes in order.
@@ -89,7 +89,7 @@ class Graph:
                 how = f"stopped with exit code {ended.si_status}"
             else:
                 how = f"was killed by {signal.Signals(ended.si_status).name}"
-            raise NodeFailure(f"the node {name} (process {process.pid}) {how}{self._last_words(name)}")
+            raise NodeFailure(f"the node {name} (process {process.pid}) {how}{self._last_error(name)}")
 
     def stop(self) -> None:
         """End every node and its children: asked first, killed after a few seconds."""
@@ -124,13 +124,13 @@ class Graph:
     def _log(self, name: str) -> Path:
         return self._folder / f"{name}.log"
 
-    def _last_words(self, name: str) -> str:
-        """What the node said last: the error that its traceback ends with, or its last line."""
+    def _last_error(self, name: str) -> str:
+        """The error that the node's last traceback ends with, or the last line of its output; where all of it is."""
         lines = [line.strip() for line in self._log(name).read_text(errors="replace").splitlines() if line.strip()]
         errors = [line for line in lines if re.match(r"([\w.]+(Error|Exception|Interrupt)|error): ", line)]
         if not lines:
             return ""
-        return f": {(errors or lines)[-1]}\nAll it said: {self._log(name)}"
+        return f": {(errors or lines)[-1]}\nIts whole output: {self._log(name)}"
 
     @staticmethod
     def _has_ended(process: subprocess.Popen[bytes]) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a replay has found, written to its folder: the files of the survey, and out.mcap for viewers."""
+"""Writes the results of a replay: the files of the survey, and out.mcap for viewers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pi
 
 
 def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> Product:
-    """pipes.json, progress.csv, cloud.ply, cloud.las, trajectory.tum, frames.csv; returns what the first two hold."""
+    """Write pipes.json, progress.csv, cloud.ply, cloud.las, trajectory.tum, frames.csv; returns the product."""
     product = product_from_msg(survey.pipes)
     scale = result_files.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
     result_files.write_pipes(folder.file("pipes.json"), product, scale)
@@ -48,7 +48,7 @@ def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> P
 
 
 def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmStatus) -> None:
-    """The results into out.mcap, at the time of the first keyframe: a viewer shows them from the start."""
+    """Write the results into out.mcap, at the time of the first keyframe: a viewer shows them from the start."""
     stamp = messages.stamp_ns(survey.poses.poses[0].header.stamp)
     recorded = [(topic, getattr(survey, name)) for name, topic in _SURVEY_TOPICS.items()] + [("sfm_status", status)]
     for topic, message in recorded:
@@ -56,7 +56,7 @@ def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmSta
 
 
 def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
-    """The keyframes into out.mcap, with the calibration that each went out with."""
+    """Write the keyframes into out.mcap, each with the calibration that was sent with it."""
     chosen = {row.stamp for row in log.rows() if row.chosen}
     for frame in bag:
         if frame.stamp not in chosen or not cdr.is_whole(frame.data, bag.image_type):
@@ -72,7 +72,7 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
 
 
 def product_from_msg(message: msg.PipeArray) -> Product:
-    """The product as the detector told it on `pipes`."""
+    """The product in a message of the topic `pipes`."""
     return Product(
         [_pipe(pipe) for pipe in message.pipes],
         [_progress(entry) for entry in message.classes],

@@ -16,8 +16,8 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 
 _IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
-# Depth and disparity images travel as the same message types; no camera's picture has these encodings.
 TF, TF_STATIC = "/tf", "/tf_static"
+# Depth and disparity images have the same message types as pictures; no camera's picture has these encodings.
 _DEPTH_ENCODINGS = ("16UC1", "32FC1", "32FC2")
 
 
@@ -51,7 +51,7 @@ class Bag:
     image_count: int
     camera: Camera
     motion_topics: dict[str, str]  # of the recording -> of the graph
-    notes: list[str]  # what a person should know of the choice of topics
+    notes: list[str]  # one sentence for each kind of motion that is not used, and why
     _motion_types: dict[str, str]
     _files: tuple[McapFile, ...]
     _first_info: bytes
@@ -98,7 +98,7 @@ class Bag:
         return (message for message in self._stream(set()) if isinstance(message, ImageMessage))
 
     def with_motion(self) -> Iterator[ImageMessage | MotionMessage]:
-        """Stream the images and what odometry, TF and IMU tell between them; static transforms come first."""
+        """Stream the images, and the messages of odometry, TF and IMU between them; static transforms come first."""
         for topic in sorted(self.motion_topics):
             if self.motion_topics[topic] == TF_STATIC:
                 for message in _messages(self._files, {topic}):
@@ -127,7 +127,7 @@ class Bag:
 
     @property
     def losses(self) -> list[str]:
-        """What the recording has lost, one sentence each; complete once it was read to its end."""
+        """The parts of the recording that cannot be read, one sentence each; complete once it was read to its end."""
         return [note for file in self._files for note in file.losses()]
 
     def _check_size(self) -> None:
@@ -214,7 +214,7 @@ def _choose(
             )
     cameras = [topic for topic in images if not _is_depth(files, topic, types[topic])]
     if image_topic is None:
-        # The same picture is often recorded raw and compressed; the compressed one is what the graph passes on anyway.
+        # The same picture is often recorded raw and compressed; frames passes keyframes on compressed in any case.
         cameras = [
             topic for topic in cameras if types[topic] == cdr.COMPRESSED_IMAGE or f"{topic}/compressed" not in cameras
         ]

@@ -131,7 +131,7 @@ def image_encoding(data: bytes, type_name: str) -> str:
 
 
 def is_whole(data: bytes, type_name: str) -> bool:
-    """Whether an image message is as long as it says; what its pixels hold is another matter."""
+    """Whether an image message is as long as its length field says; the pixels are not decoded."""
     try:
         reader = _Reader(data)
         reader.header()

@@ -68,7 +68,7 @@ class _Block:
 
 @dataclass
 class McapFile:
-    """Channels, blocks and losses of one file; open it with `McapFile.open`."""
+    """Channels, message counts and losses of one file, and its messages; open it with `McapFile.open`."""
 
     path: Path
     channels: dict[int, Channel]
@@ -123,7 +123,7 @@ class McapFile:
                 yield heapq.heappop(waiting)[3]
 
     def losses(self) -> list[str]:
-        """What could not be read, one sentence each; a damaged chunk is known once its messages were asked for."""
+        """The parts that cannot be read, one sentence each; a damaged chunk is known once its messages were read."""
         notes = []
         if self.torn_at is not None:
             notes.append(
@@ -146,8 +146,8 @@ class McapFile:
             if opcode == Opcode.CHUNK and data_section:
                 self._add_chunk(stream, position, min(end, size), whole)
             if not whole:
-                # Zeros or noise behind the last record are a tear as well: a file system may extend a file that never
-                # got its data.
+                # Zeros or noise behind the last record are a tear as well: after a power loss a file system may keep
+                # the length of a file without its data.
                 self.torn_at = size if opcode == Opcode.CHUNK else position
                 return
             if opcode == Opcode.FOOTER:
@@ -248,7 +248,7 @@ def _inflate(data: bytes, compression: str) -> bytes:
         raise InputError(f"chunks are compressed with '{compression}': use one of zstd, lz4, none")
     pieces = []
     # The fault's type differs from library to library (zstandard.ZstdError, RuntimeError, EOFError); all derive from
-    # Exception alone, and each means the same: nothing more to be had.
+    # Exception alone, and each means that the rest of the stream cannot be decoded.
     with contextlib.suppress(Exception):
         for start in range(0, len(data), _PIECE):
             pieces.append(decompressor.decompress(data[start : start + _PIECE]))

@@ -11,15 +11,17 @@ import matplotlib as mpl
 import numpy as np
 
 from pipeprog_bringup.report.survey_reader import Survey
+from pipeprog_camera.arrays import FloatArray
 
 mpl.use("Agg")
 from matplotlib import dates
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 
 def plan(survey: Survey) -> Figure:
-    """Pipes and the camera's way seen from above."""
+    """Pipes and the camera's path seen from above."""
     figure, axes = plt.subplots(figsize=(10, 5.5))
     for pipe in survey.pipes:
         cylinder = survey.cylinder(pipe)
@@ -45,15 +47,20 @@ def radii_and_classes(survey: Survey) -> Figure:
     """Metres by measured radius over the classes' bands, and each pipe's distance from its nominal radius."""
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(10, 6), height_ratios=(3, 2))
     radii = np.array([1e3 * float(pipe["radius"]) for pipe in survey.pipes])
-    lengths = np.array([float(pipe["length"]) for pipe in survey.pipes])
     nominal = {str(entry["class"]): 1e3 * float(entry["outer_radius"]) for entry in survey.classes}
+    _draw_radii(top, survey, radii, nominal)
+    _draw_deviations(bottom, survey, radii, nominal)
+    return _finished(figure)
+
+
+def _draw_radii(axes: Axes, survey: Survey, radii: FloatArray, nominal: dict[str, float]) -> None:
+    """Histogram of the metres by radius [mm], and the band of each class."""
     highest = 1.15 * max(radii.max(), *nominal.values()) if nominal else 1.15 * radii.max()
-    bins = np.arange(0, highest + 2, 2.0)
     for name, radius in nominal.items():
-        # 1 % of the diameter is what manufacture may deviate (EN 10255); a millimetre is the least that shows.
+        # Tolerance of manufacture, 1 % of the diameter (EN 10255); at least 1 mm, to be visible.
         band = max(0.02 * radius, 1.0)
-        top.axvspan(radius - band, radius + band, color=survey.color(name), alpha=0.22, lw=0)
-        top.annotate(
+        axes.axvspan(radius - band, radius + band, color=survey.color(name), alpha=0.22, lw=0)
+        axes.annotate(
             name,
             (radius, 1.0),
             xycoords=("data", "axes fraction"),
@@ -62,41 +69,39 @@ def radii_and_classes(survey: Survey) -> Figure:
             ha="center",
             fontsize=8,
         )
+    lengths = np.array([float(pipe["length"]) for pipe in survey.pipes])
     groups = [*nominal, None]
     own = [np.array([pipe["class"] == name for pipe in survey.pipes], bool) for name in groups]
-    top.hist(
+    axes.hist(
         [radii[mask] for mask in own],
-        bins,
+        np.arange(0, highest + 2, 2.0).tolist(),
         weights=[lengths[mask] for mask in own],
         stacked=True,
         color=[survey.color(name) for name in groups],
         edgecolor="#333",
         linewidth=0.5,
     )
-    top.set(xlabel="measured outer radius [mm]", ylabel="length [m]", xlim=(0, highest))
+    axes.set(xlabel="measured outer radius [mm]", ylabel="length [m]", xlim=(0, highest))
+
+
+def _draw_deviations(axes: Axes, survey: Survey, radii: FloatArray, nominal: dict[str, float]) -> None:
+    """Each classified pipe's radius less the nominal one of its class [mm]."""
     for number, pipe in enumerate(survey.pipes):
         if pipe["class"] not in nominal:
             continue
+        deviation = radii[number] - nominal[pipe["class"]]
         sigma = 3e3 * float(pipe["radius_sigma"] or 0)
-        bottom.errorbar(number, radii[number] - nominal[pipe["class"]], sigma, color="#333", capsize=3, lw=1, zorder=1)
-        bottom.scatter(
-            number,
-            radii[number] - nominal[pipe["class"]],
-            40,
-            color=[survey.color(pipe["class"])],
-            edgecolor="#333",
-            lw=0.6,
-            zorder=2,
-        )
-    bottom.axhline(0, color="#888", lw=0.8)
-    bottom.set_xticks(
+        color = [survey.color(pipe["class"])]
+        axes.errorbar(number, deviation, sigma, color="#333", capsize=3, lw=1, zorder=1)
+        axes.scatter(number, deviation, 40, color=color, edgecolor="#333", lw=0.6, zorder=2)
+    axes.axhline(0, color="#888", lw=0.8)
+    axes.set_xticks(
         range(len(survey.pipes)),
         [str(pipe["id"]) for pipe in survey.pipes],
         fontsize=8,
         rotation=90 if len(survey.pipes) > 20 else 0,
     )
-    bottom.set(ylabel="radius - nominal [mm]\n(bars: 3 sigma)", xlim=(-0.7, len(survey.pipes) - 0.3))
-    return _finished(figure)
+    axes.set(ylabel="radius - nominal [mm]\n(bars: 3 sigma)", xlim=(-0.7, len(survey.pipes) - 0.3))
 
 
 def series(surveys: Sequence[Survey]) -> Figure:

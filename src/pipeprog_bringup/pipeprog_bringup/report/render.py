@@ -18,7 +18,7 @@ Color = tuple[float, float, float]
 
 # Everything is drawn twice as large and reduced, which smooths the edges.
 OVERSAMPLING = 2
-MAX_POINTS = 2_000_000
+MAX_POINTS = 2_000_000  # of a larger cloud every n-th point is drawn: a picture has 4 million pixels before reduction
 BACKGROUND = (247, 248, 250)
 # How far a pipe's surface is lifted above the points that it was fitted to, so that they do not hide it [m].
 LIFT = 0.025
@@ -77,7 +77,7 @@ def two_sides(points: FloatArray, pipes: Sequence[ColoredPipe]) -> list[FloatArr
     shown = _shown(points, pipes)
     cloud = points[shown[:: max(1, len(shown) // 50_000)]]
     hidden = np.array([_hiding(cloud, pipes, _screen_axes(direction)) for direction in directions])
-    # Sides that are alike in this are told apart by how the pipes overlap: neighbours share the verdict.
+    # Averaged over three neighbouring directions: one that happens to see through a gap is not preferred.
     hidden = np.mean([np.roll(hidden, shift) for shift in (-1, 0, 1)], axis=0)
     first = int(hidden.argmin())
     turn = np.abs((azimuths - azimuths[first] + np.pi) % (2 * np.pi) - np.pi)
@@ -170,7 +170,7 @@ def _frame(cloud: FloatArray, pipes: Sequence[ColoredPipe], axes: FloatArray) ->
 
 
 def _shown(points: FloatArray, pipes: Sequence[ColoredPipe]) -> NDArray[np.int64]:
-    """The points worth showing: around the pipes, or all that are no outliers; not more than MAX_POINTS."""
+    """Indices of the points to draw: around the pipes, or without pipes all but the outermost; at most MAX_POINTS."""
     if not len(points):
         return np.empty(0, np.int64)
     if pipes:

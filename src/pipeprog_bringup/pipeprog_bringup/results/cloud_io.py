@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds from files, and to them: PLY, PCD, LAS/LAZ, E57 and text, in metres."""
+"""Point clouds from files, and to them: PLY, PCD, LAS/LAZ, E57 and text, in metres.
+
+The readers are plyfile, pypcd4, laspy and pye57, and not Open3D's read_point_cloud: that returns 0 points for a file
+that is missing and 3 points, with a warning and no exception, for a PLY that is cut off, and it turns all coordinates
+into doubles, so that nobody can see that a file's 32-bit coordinates are too coarse (see RESOLUTION).
+"""
 
 from __future__ import annotations
 
@@ -15,8 +20,8 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.types import Cloud
 
-# Coarser coordinates than this cannot hold a pipe of 8.6 mm radius.
-RESOLUTION = 0.005
+# Coordinates with steps above this cannot show a pipe of 8.6 mm radius, the thinnest of the paper.
+RESOLUTION = 0.005  # m
 LAS_STEP = 1e-4  # m between the whole numbers that LAS keeps: a hundredth of the noise of a point
 _NORMALS = ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz")
 
@@ -46,7 +51,7 @@ def read_cloud(path: str | Path) -> CloudFile:
         raise
     except MemoryError:
         raise InputError(f"{path} does not fit into memory: thin it out first") from None
-    # The parsers are other people's and raise whatever their damaged input leads to.
+    # The four libraries raise exceptions of any type for damaged files.
     except Exception as error:
         raise InputError(f"{path} cannot be read as {path.suffix}: {error or type(error).__name__}") from None
     return _cloud_file(path, columns)
@@ -59,6 +64,8 @@ def write_ply(
     normals: NDArray[np.floating] | None = None,
 ) -> None:
     """Binary PLY of points (N, 3) [m] as float32, with colours (N, 3) and normals (N, 3) where they are given."""
+    from plyfile import PlyData, PlyElement
+
     columns: list[tuple[str, str, NDArray]] = [(axis, "<f4", points[:, i]) for i, axis in enumerate("xyz")]
     if normals is not None:
         columns += [(name, "<f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
@@ -67,11 +74,7 @@ def write_ply(
     vertices = np.empty(len(points), [(name, kind) for name, kind, _ in columns])
     for name, _, values in columns:
         vertices[name] = values
-    properties = [f"property {'uchar' if kind == 'u1' else 'float'} {name}" for name, kind, _ in columns]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header"]
-    with path.open("wb") as stream:
-        stream.write("\n".join(header).encode() + b"\n")
-        vertices.tofile(stream)
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
 
 
 def write_las(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a run, as DESIGN and docs/architecture.md fix them: writers, and readers of what scoring needs."""
+"""The files of a results folder, which docs/files.md describes: their writers, and readers of two of them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class FrameRow:
 
 
 def write_pipes(path: Path, product: Product, scale: Scale) -> None:
-    """pipes.json, one line a pipe; lengths rounded to the micrometre, far below what any measurement tells."""
+    """pipes.json, one line a pipe; lengths rounded to the micrometre, far below the error of any measurement."""
     head = {"frame_id": "map", "scale": {"source": scale.source, "sigma": _significant(scale.sigma)}}
     rows = {
         "pipes": [_pipe_entry(pipe) for pipe in product.pipes],
@@ -124,7 +124,7 @@ def write_config(path: Path, config: dict[str, Any]) -> None:
 
 
 def write_run(folder: OutputFolder, facts: dict[str, Any]) -> None:
-    """run.json, the last file of a run: what ran, on what, for how long, with which versions, and what it wrote."""
+    """run.json, the last file that is written: command, input, timings, versions, and the list of all files."""
     path = folder.file("run.json")
     versions = {"python": platform.python_version(), "pipeprog": package_version("pipeprog")}
     versions.update({name: package_version(name) for name in _PACKAGES})

@@ -31,8 +31,8 @@ OVERLAP_MIN = 0.5
 IGNORE_ANGLE_MAX = np.radians(15.0)
 # A true radius belongs to the class within the tolerance of manufacture (1 % of the diameter, EN 10255).
 CLASS_TOLERANCE = 0.01
-# Stamps in trajectory.tum are seconds as decimals; other tools round them to milliseconds at worst.
-STAMP_TOLERANCE = 1_000_000
+# Stamps in trajectory.tum are seconds as decimals, which other tools round to milliseconds at worst.
+STAMP_TOLERANCE = 1_000_000  # ns
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Result:
-    """What pipes.json says: detections in `map`, and the classes' radii [m]."""
+    """The content of pipes.json: detections in `map`, and the classes' radii [m]."""
 
     pipes: tuple[Segment, ...]
     class_radii: dict[str, float]
@@ -136,7 +136,7 @@ def score(result: Result, truth: Truth, trajectory: Alignment | None = None) -> 
 
 
 def match(found: Sequence[Segment], truth: Sequence[Segment]) -> dict[int, int]:
-    """One-to-one {detection: true pipe}: as many as possible, then those that agree best along the axis."""
+    """The largest one-to-one matching {detection: true pipe}; of several the one that agrees best along the axes."""
     weights = np.zeros((len(found), len(truth)))
     for i, detection in enumerate(found):
         for j, pipe in enumerate(truth):
@@ -357,7 +357,7 @@ def _length_figures(
     class_radii: dict[str, float],
     true_classes: list[list[str]],
 ) -> dict[str, Any]:
-    """Mean absolute error a pipe (Eq. 5), and per class the metres that the report would bill against the true ones."""
+    """Mean absolute error a pipe (Eq. 5), and for each class the metres found against the true ones."""
     per_class = []
     for name in class_radii:
         true = sum(pipe.length for pipe, names in zip(truth.pipes, true_classes, strict=True) if name in names)
