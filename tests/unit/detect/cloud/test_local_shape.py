@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shape of the cloud around sites."""
 
 from __future__ import annotations
