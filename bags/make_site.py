@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -19,27 +20,28 @@ from rich.progress import track
 
 from sitegen.field import build_field
 from sitegen.lab import build_lab
-from sitegen.motion import Robot, tell
 from sitegen.recording import (
     FIRST_STAMP,
     camera_info,
     truth,
     write_bag,
-    write_bill,
     write_boards,
+    write_boq,
     write_truth,
 )
 from sitegen.render import Lens, Scene, build_scene
+from sitegen.robot import Robot, robot_messages
 from sitegen.sensor import Sensor, compress, develop, expose
-from sitegen.visibility import coverage, visible_surface
+from sitegen.site import Site
+from sitegen.visibility import Coverage, coverage, visible_surface
 from sitegen.walk import Walk
 
 _FOCAL_OVER_WIDTH = 0.714  # 70 degrees across, a phone's main camera
 _SIZES = {"480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
-_PREVIEW_WIDTH = 320  # pixels across, enough for the thinnest pipe at two metres to be two wide
+_PREVIEW_WIDTH = 320  # px; the thinnest pipe is then 2 px wide at 2 m
 _LAB_SECONDS = 16.0
-_MOTION_SEED = 1 << 20  # beyond the frames' seeds
-_SURFACE_VIEWS = 20  # about a million points
+_MOTION_SEED = 1 << 20  # beyond the numbers of frames, which are their seeds
+_SURFACE_VIEWS = 20  # images that contribute true surface points: a million points
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -58,21 +60,6 @@ class Size(str, Enum):
     p720 = "720p"
     p1080 = "1080p"
     p2160 = "4k"
-
-
-def _frames(
-    scene: Scene, lens: Lens, walk: Walk, sensor: Sensor, times: NDArray[np.float64], seed: int, jobs: int
-) -> Iterator[tuple[int, bytes]]:
-    """Stamps and JPEGs in order; `jobs` frames at a time, each with noise of its own seed."""
-
-    def make(index: int) -> tuple[int, bytes]:
-        linear = expose(scene, lens, walk, sensor, float(times[index]))
-        image = develop(linear, sensor, np.random.default_rng([seed, index]))
-        return FIRST_STAMP + round(float(times[index]) * 1e9), compress(image, sensor)
-
-    with ThreadPoolExecutor(jobs) as pool:
-        for first in range(0, len(times), jobs):
-            yield from pool.map(make, range(first, min(first + jobs, len(times))))
 
 
 @app.command()
@@ -96,7 +83,7 @@ def make_site(
     distortion: Annotated[str, typer.Option(help="plumb_bob k1,k2,p1,p2,k3 of the lens")] = "0,0,0,0,0",
     hide_distortion: Annotated[bool, typer.Option(help="CameraInfo says there is no distortion")] = False,
     focal_error: Annotated[float, typer.Option(help="percent by which CameraInfo's focal length is off")] = 0.0,
-    robot: Annotated[bool, typer.Option(help="also what a robot tells: /odom, /imu and /tf_static")] = False,
+    robot: Annotated[bool, typer.Option(help="also a robot's /odom, /imu and /tf_static")] = False,
     odometry_error: Annotated[float, typer.Option(help="percent by which odometry's lengths are off")] = 0.0,
     surface: Annotated[bool, typer.Option(help="also NAME.surface.npz: true surface points and their pipes")] = False,
     board_error_mm: Annotated[float, typer.Option(help="standard deviation of a printed circle's place", min=0)] = 0.0,
@@ -105,14 +92,7 @@ def make_site(
 ) -> None:
     """Build a site from a seed, walk a camera through it, and write what it sees and what is true."""
     console = Console(stderr=True)
-    try:
-        k1, k2, p1, p2, k3 = (float(value) for value in distortion.split(","))
-    except ValueError:
-        raise typer.BadParameter(f"'{distortion}': give five numbers, k1,k2,p1,p2,k3") from None
-    width, height = _SIZES[size.value]
-    focal = _FOCAL_OVER_WIDTH * width
-    lens = Lens(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, (k1, k2, p1, p2, k3))
-
+    lens = _lens(size, distortion)
     rng = np.random.default_rng(seed)
     build = build_lab if layout == Layout.lab else build_field
     try:
@@ -127,8 +107,67 @@ def make_site(
     times = np.arange(max(math.floor(seconds * fps), 1)) / fps
     poses = walk.poses(times)
 
-    preview = lens.reduced(max(width // _PREVIEW_WIDTH, 1))
+    preview = lens.reduced(max(lens.width // _PREVIEW_WIDTH, 1))
     seen = coverage(scene, site.pipes, preview, poses)
+    _refuse_hidden(console, site, seen, allow_hidden)
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    stem = out.with_suffix("")
+    write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, [c.share for c in seen]))
+    write_boq(Path(f"{stem}.boq.yaml"), site)
+    write_boards(Path(f"{stem}.board.yaml"), site)
+    if surface:
+        points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
+        np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
+    # The recording is written last: where it exists, all files that belong to it exist, too.
+    sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain)
+    frames = _frames(Shot(scene, lens, walk, sensor), times, seed, jobs)
+    motion_rng = np.random.default_rng([seed, _MOTION_SEED])
+    motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng)
+    shown = track(frames, total=len(times), description=out.name, console=console)
+    write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown, motion if robot else ())
+    console.print(f"{out}: {len(times)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A camera on its walk through a scene."""
+
+    scene: Scene
+    lens: Lens
+    walk: Walk
+    sensor: Sensor
+
+    def jpeg(self, time: float, rng: np.random.Generator) -> bytes:
+        """The frame at a time, s, with noise from `rng`."""
+        linear = expose(self.scene, self.lens, self.walk, self.sensor, time)
+        return compress(develop(linear, self.sensor, rng), self.sensor)
+
+
+def _frames(shot: Shot, times: NDArray[np.float64], seed: int, jobs: int) -> Iterator[tuple[int, bytes]]:
+    """Stamps and JPEGs in order; `jobs` frames at a time, each with noise of its own seed."""
+
+    def make(index: int) -> tuple[int, bytes]:
+        time = float(times[index])
+        return FIRST_STAMP + round(time * 1e9), shot.jpeg(time, np.random.default_rng([seed, index]))
+
+    with ThreadPoolExecutor(jobs) as pool:
+        for first in range(0, len(times), jobs):
+            yield from pool.map(make, range(first, min(first + jobs, len(times))))
+
+
+def _lens(size: Size, distortion: str) -> Lens:
+    try:
+        k1, k2, p1, p2, k3 = (float(value) for value in distortion.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"'{distortion}': give five numbers, k1,k2,p1,p2,k3") from None
+    width, height = _SIZES[size.value]
+    focal = _FOCAL_OVER_WIDTH * width
+    return Lens(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, (k1, k2, p1, p2, k3))
+
+
+def _refuse_hidden(console: Console, site: Site, seen: Sequence[Coverage], allowed: bool) -> None:
+    """Lists the pipes that a recording hardly shows, and ends unless that is allowed."""
     hidden = [
         f"pipe {k} ({site.pipes[k].radius * 1e3:g} mm): {c.frames} frames, {100 * c.share:.0f} % of its length"
         for k, c in enumerate(seen)
@@ -136,27 +175,9 @@ def make_site(
     ]
     if hidden:
         console.print("hardly seen:", *hidden, sep="\n  ")
-        if not allow_hidden:
+        if not allowed:
             console.print("choose another seed, a longer walk or more frames, or pass --allow-hidden")
             raise typer.Exit(1)
-
-    out.parent.mkdir(parents=True, exist_ok=True)
-    stem = out.with_suffix("")
-    sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain)
-    frames = _frames(scene, lens, walk, sensor, times, seed, jobs)
-    shown = track(frames, total=len(times), description=out.name, console=console)
-    write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, [c.share for c in seen]))
-    write_bill(Path(f"{stem}.boq.yaml"), site)
-    write_boards(Path(f"{stem}.board.yaml"), site)
-    if surface:
-        points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
-        np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
-    # Last: where the recording is, all that belongs to it is there too.
-    motion = tell(
-        walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, np.random.default_rng([seed, _MOTION_SEED])
-    )
-    write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown, motion if robot else ())
-    console.print(f"{out}: {len(times)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":

@@ -32,15 +32,15 @@ FloatArray = NDArray[np.float64]
 
 _WIDTH, _HEIGHT, _DEPTH = 10.0, 3.2, 4.6
 _COUNTS = dict(zip(FIELD_RADII, (8, 10, 10, 10, 10, 10), strict=True))
-_LAYOUTS = 40  # layouts drawn until one lets every pipe be seen
-_PLACINGS = 6000
-_RACK_DEPTH = -1.95  # the ceiling rack ends where the path still sees it from beside
+_LAYOUTS = 40  # layouts drawn until one shows every pipe
+_PLACINGS = 6000  # attempts to place the pipes of a layout
+_RACK_DEPTH = -1.95  # m; further from the wall the path would be below the ceiling rack
 _GAP = 0.025  # metres of air between pipes that were not installed side by side
 _PROBE = Lens(214, 120, 153.0, 153.0, 106.5, 59.5)
 
 
 class _Room:
-    """A site being filled: the pipes still to be placed, and what they must keep clear of."""
+    """A site being filled: the pipes still to be placed, and the boxes that they must not enter."""
 
     def __init__(self, site: Site, rng: np.random.Generator) -> None:
         self.site = site
@@ -79,7 +79,7 @@ class _Room:
     def place(
         self, start: ArrayLike, end: ArrayLike, radius: float, ends: tuple[str, str], towards: ArrayLike | None
     ) -> None:
-        """Put a pipe in; `towards` is the way to the wall or ceiling that its two clamps hold on to."""
+        """Puts a pipe in; `towards` is the direction to the wall or ceiling that its two clamps are fixed to."""
         a, b = np.asarray(start, float), np.asarray(end, float)
         index = self.site.pipe(a, b, radius, self.material(radius), ends)
         self.pool.remove(radius)
@@ -184,8 +184,8 @@ def _racks(room: _Room) -> None:
         z += radius + max(2 * radius * room.uniform(0.30, 0.75), 0.02)
 
 
-def _loose(room: _Room) -> bool:
-    """Chains, crossings, inclined and lone pipes until none is left; False where they do not fit."""
+def _remaining(room: _Room) -> bool:
+    """Places chains, crossings, inclined and single pipes until none is left; False where they do not fit."""
     uniform = room.uniform
     for _ in range(_PLACINGS):
         if not room.pool:
@@ -277,7 +277,7 @@ def build_field(
         room = _Room(site, rng)
         _shell(room)
         _racks(room)
-        if not _loose(room):
+        if not _remaining(room):
             continue
         _clutter(room)
         for x in (1.8, 5.0, 8.2):

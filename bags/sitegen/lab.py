@@ -38,10 +38,27 @@ def build_lab(
     site.wall((_WIDTH / 2, -_DEPTH / 2, 0.0), (0, 0, 1), _WIDTH, _DEPTH, SCREED)
 
     radii = [float(radius) for radius in rng.permutation(LAB_RADII)]
-    standing, lying = radii[:3], [*radii[3:], _ELBOW_RADIUS]
+    left = _standing_pipes(site, rng, radii[:3]) + rng.uniform(0.02, 0.10)
+    _lying_pipes(site, rng, [*radii[3:], _ELBOW_RADIUS], left)
 
+    centre = left + rng.uniform(0.4, 1.0)
+    site.board((centre, 0.0, rng.uniform(2.07, 2.15)), (0, -1, 0), rng.spawn(1)[0])
+    site.box((left - 0.1, -0.24, 2.50), (_WIDTH - 0.2, -0.03, 2.72), GALVANISED)
+
+    lamp = rng.uniform(-0.4, 0.4)
+    site.tube_lamp((1.0 + lamp, -1.9, 2.85), (2.4 + lamp, -1.9, 2.85), 3.2, 3)
+    site.tube_lamp((3.9, -3.2, 2.3), (3.9, -3.2, 2.3), 2.6, 1)
+    site.ambient = 0.35
+    site.gain = 0.75
+    site.waypoints = _waypoints(-distance, max(left + 1.1, 2.4))
+    site.closed_walk = True
+    return site
+
+
+def _standing_pipes(site: Site, rng: np.random.Generator, radii: list[float]) -> float:
+    """Vertical pipes from the side wall on, clamped to the wall; returns the x that they leave free, m."""
     x = rng.uniform(0.12, 0.25)
-    for radius in standing:
+    for radius in radii:
         x += radius
         y = -(radius + rng.uniform(0.025, 0.075))
         on_floor = rng.random() < 0.4
@@ -53,10 +70,13 @@ def build_lab(
         for share in (rng.uniform(0.12, 0.25), rng.uniform(0.75, 0.88)):
             site.clamp(pipe, share * (top - bottom), (0, 1, 0), -y)
         x += radius + rng.uniform(0.14, 0.28)
+    return float(x)
 
-    left = x + rng.uniform(0.02, 0.10)
+
+def _lying_pipes(site: Site, rng: np.random.Generator, radii: list[float], left: float) -> None:
+    """Horizontal pipes from x = left on, clamped to the wall, the last of them with an elbow and a stub."""
     heights = rng.permutation(np.linspace(0.55, 1.72, 3) + rng.uniform(-0.08, 0.08, 3))
-    for k, (radius, z) in enumerate(zip(lying, heights, strict=True)):
+    for k, (radius, z) in enumerate(zip(radii, heights, strict=True)):
         start = left + rng.uniform(0.0, 0.15)
         end = start + rng.uniform(1.20, 1.55)
         y = -(radius + rng.uniform(0.025, 0.075))
@@ -64,7 +84,7 @@ def build_lab(
         m = _material(radius, rng)
         a, b = np.array([start, y, z]), np.array([end, y, z + slope])
         ends = ("free", "free")
-        if k == len(lying) - 1:
+        if k == len(radii) - 1:
             axis, down = unit(b - a), np.array([0.0, 0.0, -1.0])
             tangent = bend_tangent(axis, down, BEND * radius)
             site.elbow(b, axis, down, radius, m)
@@ -76,17 +96,9 @@ def build_lab(
         for share in (rng.uniform(0.12, 0.25), rng.uniform(0.70, 0.85)):
             site.clamp(pipe, share * length, (0, 1, 0), -y)
 
-    centre = left + rng.uniform(0.4, 1.0)
-    site.board((centre, 0.0, rng.uniform(2.07, 2.15)), (0, -1, 0), rng.spawn(1)[0])
-    site.box((left - 0.1, -0.24, 2.50), (_WIDTH - 0.2, -0.03, 2.72), GALVANISED)
 
-    lamp = rng.uniform(-0.4, 0.4)
-    site.tube_lamp((1.0 + lamp, -1.9, 2.85), (2.4 + lamp, -1.9, 2.85), 3.2, 3)
-    site.tube_lamp((3.9, -3.2, 2.3), (3.9, -3.2, 2.3), 2.6, 1)
-    site.ambient = 0.35
-    site.gain = 0.75
-
-    y, right = -distance, max(left + 1.1, 2.4)
+def _waypoints(y: float, right: float) -> list[list[float]]:
+    """Two laps along the wall, at eye height to x = right and back low down; x, y, z, yaw, pitch (m, rad)."""
     high, low = 1.60, 0.86
     turn = math.radians(9.0)
     lap = [
@@ -100,8 +112,5 @@ def build_lab(
         [0.95, y, low, -turn, -0.05],
         [0.35, y - 0.05, (high + low) / 2, -turn, 0.0],
     ]
-    # Nobody walks the same line twice.
-    again = [[x + 0.15, y - 0.12, z + 0.07, yaw, pitch] for x, y, z, yaw, pitch in lap]
-    site.waypoints = [*lap, *again]
-    site.closed_walk = True
-    return site
+    # The second lap takes another line, as a person would.
+    return [*lap, *([x + 0.15, y - 0.12, z + 0.07, yaw, pitch] for x, y, z, yaw, pitch in lap)]

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import math
+from collections import deque
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,8 @@ import numpy as np
 from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
-from sitegen.motion import CAMERA_FRAME, Told
 from sitegen.render import Lens
+from sitegen.robot import CAMERA_FRAME, RobotMessage
 from sitegen.site import BOARD_CENTRES, BOARD_CIRCLE_RADIUS, CLASSES, Site
 
 FloatArray = NDArray[np.float64]
@@ -62,7 +64,7 @@ _MOTION = {
 
 
 def camera_info(lens: Lens, focal_error: float, leave_out_distortion: bool) -> dict[str, Any]:
-    """The CameraInfo that a calibration would have given; `focal_error` is relative. No header."""
+    """The CameraInfo of a calibration, without header; `focal_error` is relative."""
     fx, fy = lens.fx * (1 + focal_error), lens.fy * (1 + focal_error)
     return {
         "height": lens.height,
@@ -79,31 +81,32 @@ def camera_info(lens: Lens, focal_error: float, leave_out_distortion: bool) -> d
 
 
 def write_bag(
-    path: Path, info: dict[str, Any], frames: Iterable[tuple[int, bytes]], motion: Iterable[Told] = ()
+    path: Path, info: dict[str, Any], frames: Iterable[tuple[int, bytes]], motion: Iterable[RobotMessage] = ()
 ) -> None:
     """Write (stamp in ns, JPEG bytes) with one CameraInfo each, at equal stamps; a file under its name is complete.
 
-    `motion` is what a robot told, in order of time.
+    `motion` are the messages of a robot, in order of time.
     """
     part = path.with_name(path.name + ".part")
     with part.open("wb") as stream, Writer(stream) as writer:
         image_schema = writer.register_msgdef("sensor_msgs/msg/CompressedImage", _IMAGE)
         info_schema = writer.register_msgdef("sensor_msgs/msg/CameraInfo", _INFO)
         schemas = {name: writer.register_msgdef(name, text) for name, text in _MOTION.items()}
-        waiting = iter(motion)
-        told = next(waiting, None)
+        waiting = deque(motion)
+
+        def write_motion(until: float) -> None:
+            while waiting and waiting[0].stamp <= until:
+                one = waiting.popleft()
+                writer.write_message(one.topic, schemas[one.type_name], one.message, one.stamp, one.stamp)
+
         for sequence, (stamp, data) in enumerate(frames):
-            while told is not None and told.stamp <= stamp:
-                writer.write_message(told.topic, schemas[told.type_name], told.message, told.stamp, told.stamp)
-                told = next(waiting, None)
+            write_motion(stamp)
             header = {"stamp": {"sec": stamp // _SECOND, "nanosec": stamp % _SECOND}, "frame_id": FRAME_ID}
             times = {"log_time": stamp, "publish_time": stamp, "sequence": sequence}
             writer.write_message("/camera/camera_info", info_schema, {"header": header, **info}, **times)
             image = {"header": header, "format": "jpeg", "data": data}
             writer.write_message("/camera/image/compressed", image_schema, image, **times)
-        while told is not None:
-            writer.write_message(told.topic, schemas[told.type_name], told.message, told.stamp, told.stamp)
-            told = next(waiting, None)
+        write_motion(math.inf)
     part.replace(path)
 
 
@@ -149,7 +152,7 @@ def write_truth(path: Path, values: dict[str, Any]) -> None:
     path.write_text(json.dumps(values) + "\n", encoding="utf-8")
 
 
-def write_bill(path: Path, site: Site) -> None:
+def write_boq(path: Path, site: Site) -> None:
     """Write the bill of quantities."""
     lines = ["classes:"]
     for radius, metres in site.planned_lengths().items():

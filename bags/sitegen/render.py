@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sitegen.primitives import Material, Primitive
 from sitegen.raycast import STACK, Hit, IntArray, PackedTree, Tree, blocked, build_tree, nearest
-from sitegen.textures import relief
+from sitegen.textures import albedo_factor
 
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
@@ -119,7 +119,7 @@ def _cast(
     dx = pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2] * cz
     dy = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz
     dz = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz
-    p, hit = nearest(tree, stack, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz)
+    p, hit = nearest(tree, stack, (pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz))
     return p, hit, dx, dy, dz
 
 
@@ -151,7 +151,7 @@ def _shade(
     facing = -(nx * dx + ny * dy + nz * dz)
     # A pixel's side on the surface: the geometric mean of its sides across and along the slope.
     footprint = t / lens[0] / math.sqrt(max(facing, 0.1))
-    factor = relief(material, x, y, z, footprint, seeds[p])
+    factor = albedo_factor(material, x, y, z, footprint, seeds[p])
     if kinds[p] == 3 and part == 1 and x * x + y * y < (_BORE * g[12]) ** 2:
         factor *= 0.12
         part = 2
@@ -168,7 +168,7 @@ def _shade(
         cosine = nx * sx + ny * sy + nz * sz
         if cosine <= 0.0:
             continue
-        if blocked(tree, stack, ox, oy, oz, sx, sy, sz, d):
+        if blocked(tree, stack, (ox, oy, oz, sx, sy, sz), d):
             shadows |= 1 << k
             continue
         power = lamps[k, 3] / d2

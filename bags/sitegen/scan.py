@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cloud that a scanner takes of a site: what its rays meet first, with noise along them."""
+"""The point cloud of a laser scanner: the first hits of its rays, with noise."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from sitegen.raycast import STACK, PackedTree, build_tree, nearest
 
 FloatArray = NDArray[np.float64]
 
-# Surfaces met at a flatter angle give no return.
-_LEAST_COSINE = 0.25
+_MIN_COSINE = 0.25  # of the angle of incidence, 76 degrees; beyond, a surface gives no return
 
 
 def scan(
@@ -29,7 +28,7 @@ def scan(
     """Points (N, 3) [m], their normals (N, 3) towards the scanner, and which primitive each lies on (N,).
 
     From each of the stations (S, 3) a ray goes through each of the aims (A, 3). The noise, a standard deviation [m],
-    lies along the ray; across it there is the share `lateral` of it.
+    is along the ray; across it, it is the share `lateral` of that.
     """
     tree = build_tree(primitives).packed()
     geometry = tree[1]
@@ -42,7 +41,7 @@ def scan(
         normal = np.einsum("nij,ni->nj", rows, local)
         cosine = -np.einsum("ij,ij->i", normal, rays)
         normal *= np.sign(cosine)[:, None]
-        seen = (owner >= 0) & (np.abs(cosine) > _LEAST_COSINE)
+        seen = (owner >= 0) & (np.abs(cosine) > _MIN_COSINE)
         rays, distance = rays[seen], distance[seen]
         off = lateral * noise * rng.standard_normal(rays.shape)
         along = noise * np.sqrt(1.0 - lateral**2) * rng.standard_normal(len(rays))
@@ -61,7 +60,7 @@ def _first_hits(
     owner = np.full(len(rays), -1, np.int64)
     stack = np.zeros(STACK, np.int64)
     for i in range(len(rays)):
-        best, hit = nearest(tree, stack, origin[0], origin[1], origin[2], rays[i, 0], rays[i, 1], rays[i, 2])
+        best, hit = nearest(tree, stack, (origin[0], origin[1], origin[2], rays[i, 0], rays[i, 1], rays[i, 2]))
         owner[i] = best
         if best >= 0:
             distance[i] = hit[0]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sitegen.render import FloatImage, Lens, Scene, render
 from sitegen.walk import Walk
 
-_BLUR_STEP = 0.7  # pixels between the sub-frames of a blurred frame: no copies show after the lens' own blur
+_BLUR_STEP = 0.7  # px between the sub-frames of a blurred frame: less than the lens blur, so that no copies show
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ def expose(scene: Scene, lens: Lens, walk: Walk, sensor: Sensor, time: float) ->
         start, end = walk.poses([time - sensor.exposure / 2, time + sensor.exposure / 2])
         turn = np.linalg.norm(end[:3, 2] - start[:3, 2])
         shift = np.linalg.norm(end[:3, 3] - start[:3, 3])
-        pixels = lens.fx * (turn + shift / 2.0)  # things are some 2 m away
+        pixels = lens.fx * (turn + shift / 2.0)  # the walks are 2 m from what they see
         count = int(np.clip(np.ceil(pixels / _BLUR_STEP), 1, 15))
         times = list(((np.arange(count) + 0.5) / count - 0.5) * sensor.exposure)
     total = np.zeros((lens.height, lens.width, 3), np.float32)
-    # The sub-frames of a blurred frame smooth each other's edges: a quarter of the rays will do.
+    # Sub-frames smooth each other's edges, so that four rays a pixel are enough in place of sixteen.
     for offset in times:
         instants = time + offset + rows if sensor.readout > 0.0 else np.full(lens.height, time + offset)
         total += render(scene, lens, walk.poses(instants), edge_bits=4 if len(times) < 4 else 2)
@@ -49,7 +49,7 @@ def expose(scene: Scene, lens: Lens, walk: Walk, sensor: Sensor, time: float) ->
 def develop(linear: FloatImage, sensor: Sensor, rng: np.random.Generator) -> NDArray[np.uint8]:
     """8-bit BGR image: lens blur in linear light, sRGB curve, noise.
 
-    The noise is even over grey levels: photon noise grows with the root of the light, and so nearly does the curve.
+    The noise is the same at all grey levels: photon noise grows with the root of the light, and the curve nearly does.
     """
     image = linear * np.float32(sensor.gain)
     if sensor.blur > 0.0:

@@ -56,7 +56,7 @@ def _resolved(cell: float, footprint: float) -> float:
 
 
 @njit(nogil=True)
-def relief(material: NDArray[np.float64], x: float, y: float, z: float, footprint: float, seed: int) -> float:
+def albedo_factor(material: NDArray[np.float64], x: float, y: float, z: float, footprint: float, seed: int) -> float:
     """Factor on the albedo at a local point; `footprint` is a pixel's size on the surface in metres.
 
     Mottle is a sum of octaves; speckle are spots where a noise exceeds a threshold, in two sizes and in dark and

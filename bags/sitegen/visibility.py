@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a site a recording shows: coverage of each pipe, and the true surface the camera saw."""
+"""What a recording shows of a site: coverage of each pipe, and the true surface that the camera saw."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sitegen.site import Pipe
 
 FloatArray = NDArray[np.float64]
 
-_STEP = 0.02  # metres along a pipe that count as seen together
-_MIN_FRAMES = 3  # two views make a depth, a third confirms it
-_MIN_SHARE = 0.6
+_STEP = 0.02  # m, length of a bin along a pipe
+_MIN_FRAMES = 3  # two views give a depth, a third confirms it
+_MIN_SHARE = 0.6  # of the length: a pipe is then longer than its gaps
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's path: a smooth curve through waypoints at a steady speed, and a hand that holds the camera."""
+"""The camera's path: a smooth curve through waypoints at constant speed, and the sway of a hand."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline
 
 FloatArray = NDArray[np.float64]
 
-# Hand-held: slow sway, gait and tremor. Metres and radians; a tenth of walking amplitudes measured by phones in
-# a pocket would blur no picture, ten times them would be a run.
+# A hand: slow sway, gait and tremor; Hz, m, rad. The amplitudes are those of a careful person (option --wobble).
 _WOBBLE_HZ = (0.31, 0.83, 1.73)
 _WOBBLE_POSITION = (0.020, 0.010, 0.004)
 _WOBBLE_ANGLE = (0.030, 0.012, 0.004)
@@ -21,7 +20,7 @@ _WOBBLE_ANGLE = (0.030, 0.012, 0.004)
 class Walk:
     """Poses along waypoints (x, y, z, yaw, pitch): metres, radians; yaw 0 looks along +y, pitch up is positive.
 
-    With `closed` the walk goes round for ever, else it ends at the last waypoint.
+    With `closed` the walk repeats, else it ends at the last waypoint.
     """
 
     def __init__(

@@ -43,7 +43,7 @@ def test_first_hit_agrees_with_a_dense_march(seed: int) -> None:
         middle = (p.bounds[0] + p.bounds[1]) / 2
         for _ in range(40):
             direction = unit(middle + rng.normal(size=3) * 0.3 - origin)
-            hit = intersect(int(p.kind), np.array(p.row()), *origin, *direction, np.inf)
+            hit = intersect(int(p.kind), np.array(p.row()), (*origin, *direction), np.inf)
             steps = np.arange(0.0, 9.0, STEP)
             inside = depth_inside(p, origin + steps[:, None] * direction)
             if np.isfinite(hit[0]):
@@ -62,7 +62,7 @@ def test_normals_are_unit_outward_and_across_the_surface(seed: int) -> None:
         origin = 4.0 * unit(rng.normal(size=3))
         for _ in range(20):
             direction = unit((p.bounds[0] + p.bounds[1]) / 2 + rng.normal(size=3) * 0.1 - origin)
-            t, *_, nx, ny, nz, _part = intersect(int(p.kind), np.array(p.row()), *origin, *direction, np.inf)
+            t, *_, nx, ny, nz, _part = intersect(int(p.kind), np.array(p.row()), (*origin, *direction), np.inf)
             if np.isfinite(t):
                 normal = p.rotation.T @ np.array([nx, ny, nz])
                 assert np.isclose(np.linalg.norm(normal), 1.0)
@@ -75,9 +75,9 @@ def test_flat_shapes_end_at_their_rims() -> None:
     wall = rectangle((0, 0, 0), (0, -1, 0), 2.0, 1.0, PLAIN)
     spot = disc((0, 0, 0), (0, -1, 0), 0.5, PLAIN)
     for p, x, z, expected in [(wall, 0.99, 0.49, 1), (wall, 1.01, 0, 0), (wall, 0, 0.51, 0), (spot, 0.35, 0.35, 1)]:
-        t = intersect(int(p.kind), np.array(p.row()), x, -3.0, z, 0.0, 1.0, 0.0, np.inf)[0]
+        t = intersect(int(p.kind), np.array(p.row()), (x, -3.0, z, 0.0, 1.0, 0.0), np.inf)[0]
         assert (t == pytest.approx(3.0)) if expected else np.isinf(t)
-    assert np.isinf(intersect(int(spot.kind), np.array(spot.row()), 0.36, -3.0, 0.36, 0.0, 1.0, 0.0, np.inf)[0])
+    assert np.isinf(intersect(int(spot.kind), np.array(spot.row()), (0.36, -3.0, 0.36, 0.0, 1.0, 0.0), np.inf)[0])
 
 
 def test_the_hierarchy_finds_what_a_search_through_all_finds() -> None:
@@ -87,12 +87,12 @@ def test_the_hierarchy_finds_what_a_search_through_all_finds() -> None:
     stack = np.empty(STACK, np.int64)
     for _ in range(300):
         origin, direction = 4.0 * unit(rng.normal(size=3)), unit(rng.normal(size=3))
-        all_hits = [intersect(int(p.kind), np.array(p.row()), *origin, *direction, np.inf)[0] for p in primitives]
-        index, hit = nearest(tree.packed(), stack, *origin, *direction)
+        all_hits = [intersect(int(p.kind), np.array(p.row()), (*origin, *direction), np.inf)[0] for p in primitives]
+        index, hit = nearest(tree.packed(), stack, (*origin, *direction))
         assert hit[0] == min(all_hits)
         assert index == (int(np.argmin(all_hits)) if np.isfinite(hit[0]) else -1)
         for limit in (2.0, 4.0, 6.0):
-            assert blocked(tree.packed(), stack, *origin, *direction, limit) == (min(all_hits) < limit)
+            assert blocked(tree.packed(), stack, (*origin, *direction), limit) == (min(all_hits) < limit)
 
 
 def test_bounds_hold_every_hit() -> None:
@@ -102,7 +102,7 @@ def test_bounds_hold_every_hit() -> None:
             origin = 4.0 * unit(rng.normal(size=3))
             for _ in range(20):
                 direction = unit((p.bounds[0] + p.bounds[1]) / 2 + rng.normal(size=3) * 0.3 - origin)
-                t = intersect(int(p.kind), np.array(p.row()), *origin, *direction, np.inf)[0]
+                t = intersect(int(p.kind), np.array(p.row()), (*origin, *direction), np.inf)[0]
                 if np.isfinite(t):
                     point = origin + t * direction
                     assert (point > p.bounds[0] - SURFACE).all()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sitegen.motion import BASE_FROM_CAMERA, GRAVITY, Robot, tell
+from sitegen.robot import BASE_FROM_CAMERA, GRAVITY, Robot, robot_messages
 from sitegen.walk import Walk
 
 WAYPOINTS = [(0.0, 0.0, 1.5, 0.0, 0.0), (2.0, 0.3, 1.6, 0.2, 0.05), (4.0, 0.0, 1.5, -0.2, 0.0)]
@@ -14,7 +14,7 @@ EXACT = Robot(odometry_noise=0.0, imu_bias=0.0, imu_noise=0.0)
 
 def told(robot, seconds=4.0):
     walk = Walk(WAYPOINTS, 0.75, np.random.default_rng(1), False, 1.0)
-    return walk, list(tell(walk, robot, seconds, 10**18, np.random.default_rng(2)))
+    return walk, list(robot_messages(walk, robot, seconds, 10**18, np.random.default_rng(2)))
 
 
 def pose(place, turn):

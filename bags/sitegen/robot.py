@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot that carries the camera would tell of its motion: odometry, IMU, and where the camera is mounted."""
+"""The messages of a robot that carries the camera: odometry, IMU, and where the camera is mounted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CAMERA_FRAME = "camera_optical"
 
 @dataclass(frozen=True)
 class Robot:
-    """How well it knows its motion.
+    """Errors of its odometry and of its IMU.
 
     Attributes:
         scale_error: relative error of all lengths that odometry tells.
@@ -40,7 +40,7 @@ class Robot:
 
 
 @dataclass(frozen=True)
-class Told:
+class RobotMessage:
     """One message: topic, type, content as plain values, stamp in ns."""
 
     topic: str
@@ -49,15 +49,19 @@ class Told:
     stamp: int
 
 
-def tell(walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator) -> Iterator[Told]:
+def robot_messages(
+    walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator
+) -> Iterator[RobotMessage]:
     """Messages in order of time: /tf_static, then /odom and /imu from shortly before the first frame on."""
     mounted = _transform("base_link", CAMERA_FRAME, BASE_FROM_CAMERA, first_stamp)
-    yield Told("/tf_static", "tf2_msgs/msg/TFMessage", {"transforms": [mounted]}, first_stamp)
+    yield RobotMessage("/tf_static", "tf2_msgs/msg/TFMessage", {"transforms": [mounted]}, first_stamp)
     messages = [*_odometry(walk, robot, seconds, first_stamp, rng), *_imu(walk, robot, seconds, first_stamp, rng)]
-    yield from sorted(messages, key=lambda told: told.stamp)
+    yield from sorted(messages, key=lambda message: message.stamp)
 
 
-def _odometry(walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator) -> Iterator[Told]:
+def _odometry(
+    walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator
+) -> Iterator[RobotMessage]:
     times = np.arange(0.0, seconds + 1 / ODOMETRY_HZ, 1 / ODOMETRY_HZ)
     poses = walk.poses(times) @ np.linalg.inv(BASE_FROM_CAMERA)
     steps = np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3])
@@ -77,10 +81,12 @@ def _odometry(walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: n
             "pose": {"pose": {"position": place, "orientation": turn}, "covariance": [0.0] * 36},
             "twist": {"twist": {"linear": _xyz(np.zeros(3)), "angular": _xyz(np.zeros(3))}, "covariance": [0.0] * 36},
         }
-        yield Told("/odom", "nav_msgs/msg/Odometry", message, stamp)
+        yield RobotMessage("/odom", "nav_msgs/msg/Odometry", message, stamp)
 
 
-def _imu(walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator) -> Iterator[Told]:
+def _imu(
+    walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator
+) -> Iterator[RobotMessage]:
     times = np.arange(0.0, seconds + 1 / IMU_HZ, 1 / IMU_HZ)
     step = 1e-3
     before, here, after = (walk.poses(np.maximum(times + offset, 0.0)) for offset in (-step, 0.0, step))
@@ -102,7 +108,7 @@ def _imu(walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.ran
             "linear_acceleration": _xyz(value),
             "linear_acceleration_covariance": [0.0] * 9,
         }
-        yield Told("/imu", "sensor_msgs/msg/Imu", message, stamp)
+        yield RobotMessage("/imu", "sensor_msgs/msg/Imu", message, stamp)
 
 
 def _transform(parent: str, child: str, pose: FloatArray, stamp: int) -> dict[str, Any]:
