@@ -15,7 +15,7 @@ LOOKAHEAD = 2  # later keyframes whose reports a judgement waits for
 MIN_RUN = 4  # consecutive images above the band that are thinned out: the paper's "groups of more than three"
 
 # Stamp of the best frame between two stamps, some stamps excluded; None where there is none.
-BestBetween = Callable[[int, int, Collection[int]], "int | None"]
+BestBetween = Callable[[int, int, Collection[int]], int | None]
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class StreamFeedback:
     This terminates: a frame that was added is never retired, and a retired one is never added again.
     """
 
-    def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, middle: BestBetween) -> None:
+    def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, best_between: BestBetween) -> None:
         self._overlap_min, self._overlap_max, self._parallax_max = overlap_min, overlap_max, parallax_max
-        self._middle = middle
+        self._best_between = best_between
         self._stamps: list[int] = []
         self._keyframes: dict[int, _Keyframe] = {}
         self._retired: set[int] = set()
@@ -133,7 +133,7 @@ class StreamFeedback:
     def _fill(self, first: int | None, second: int | None, reason: str) -> list[Decision]:
         if first is None or second is None:
             return []
-        stamp = self._middle(first, second, self._retired)
+        stamp = self._best_between(first, second, self._retired)
         if stamp is None:
             return []
         self._insert(_Keyframe(stamp, float("nan"), float("nan"), fixed=True))

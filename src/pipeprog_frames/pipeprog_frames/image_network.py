@@ -27,9 +27,9 @@ class ImageNetwork:
     times at most, and a round without a change is the last.
     """
 
-    def __init__(self, overlap_min: float, overlap_max: float, middle: BestBetween) -> None:
+    def __init__(self, overlap_min: float, overlap_max: float, best_between: BestBetween) -> None:
         self._overlap_min, self._overlap_max = overlap_min, overlap_max
-        self._middle = middle
+        self._best_between = best_between
         self._images: list[int] = []
         self._removed: set[int] = set()
         self._fixed: set[int] = set()
@@ -107,7 +107,7 @@ class ImageNetwork:
         return decisions
 
     def _add(self, gap: tuple[int, int], reason: str) -> list[Decision]:
-        stamp = self._middle(*gap, ())
+        stamp = self._best_between(*gap, ())
         if stamp is None:
             return []
         insort(self._images, stamp)

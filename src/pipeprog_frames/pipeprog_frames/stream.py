@@ -18,11 +18,11 @@ FULL_LAG = 25  # keyframes behind at which the load counts as full: half of what
 class KeyframeStream:
     """FrameSelector and StreamFeedback together."""
 
-    def __init__(self, config: FramesConfig, camera: Camera, middle: BestBetween) -> None:
+    def __init__(self, config: FramesConfig, camera: Camera, best_between: BestBetween) -> None:
         self._selector = FrameSelector(config, camera)
         parallax_max = config.parallax_max * camera.width
         self._feedback = StreamFeedback(
-            config.overlap_min, config.overlap_min + config.overlap_band, parallax_max, middle
+            config.overlap_min, config.overlap_min + config.overlap_band, parallax_max, best_between
         )
 
     @property

@@ -136,12 +136,12 @@ def test_a_sudden_turn_after_a_rest_loses_nothing(wall: NDArray[np.uint8]) -> No
     assert chosen[-1] * step > (59 - 4) * step
 
 
-def test_relief_asks_for_fewer_keyframes(wall: NDArray[np.uint8]) -> None:
+def test_load_asks_for_fewer_keyframes(wall: NDArray[np.uint8]) -> None:
     images = [pan(wall, 6.0 * index) for index in range(120)]
     counts = []
-    for relief in (0.0, 0.5, 1.0):
+    for load_of_sfm in (0.0, 0.5, 1.0):
         selector = FrameSelector(FramesConfig(), CAMERA)
-        selector.limits.relax(relief)
+        selector.limits.relax(load_of_sfm)
         counts.append(sum(decision.chosen for decision in run(selector, images)))
     assert counts[0] > counts[1] > counts[2] > 3
 
