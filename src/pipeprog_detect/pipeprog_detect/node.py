@@ -34,7 +34,7 @@ from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 from pipeprog_node.worker import WorkerProcess
 
-MAX_PENDING = 16  # stamps of which only a part has arrived: poses come after each keyframe, maps now and then
+MAX_PENDING = 16  # stamps of which one message of three has arrived: poses come after each keyframe, maps rarely
 
 
 class DetectNode(Node):

@@ -14,12 +14,25 @@ from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.local_shape import Surfaces
 from pipeprog_detect.types import Cylinder
 
-# Votes agree on an axis within this angle (local directions scatter by 2 to 5 degrees), this share of the radius
-# across it, and this ratio of radii.
+# Votes agree on an axis within 15 deg (three times the 2 to 5 deg by which local directions scatter), 0.3 radii across
+# it and a ratio of 1.3 of the radii (a curvature counts from four standard deviations on: its radius is known to a
+# quarter). Two votes agree by chance, four on one line seldom.
 _COSINE = float(np.cos(np.radians(15.0)))
 _LATERAL = 0.3
 _RATIO = 1.3
 _LEAST_VOTES = 4
+# A curvature counts from this multiple of its standard deviation on.
+_BENT = 4.0
+# The other principal curvature, as a share of the first (or twice its standard deviation): an elbow of 1.5 diameters
+# has one of 1 / 4 along its outer side and 1 / 2 along its inner one, a sphere of 1.
+_STRAIGHT = 0.35
+# Residual of a quadric, in the noise and a floor [m] for waviness, and least share of the points that agree with it: a
+# cleft between two pipes leaves more, and fewer.
+_ROUGH, _ROUGH_FLOOR, _ONE_SURFACE = 2.0, 5e-4, 0.75
+# Gap along a line [m] (or four patches) that a clamp or an occluder explains.
+_GAP = 0.3
+# Length of the mean of the patches' unit directions from the axis: below this they lie all around.
+_ONE_SIDED = 0.3
 
 
 @dataclass(frozen=True)
@@ -61,9 +74,9 @@ def patch_votes(shape: Surfaces, sigma: float, radius_range: tuple[float, float]
     bend = np.abs(shape.curvature)
     low, high = 1.0 / radius_range[1], 1.0 / radius_range[0]
     good = (shape.count > 0) & (bend > max(low, 0.5 / shape.scale)) & (bend < min(high, 1.0 / shape.scale))
-    good &= bend > 4.0 * shape.sigma
-    good &= np.abs(shape.second) < np.maximum(0.35 * bend, 2.0 * shape.sigma)
-    good &= (shape.rms < 2.0 * sigma + 5e-4) & (shape.inliers > 0.75)
+    good &= bend > _BENT * shape.sigma
+    good &= np.abs(shape.second) < np.maximum(_STRAIGHT * bend, 2.0 * shape.sigma)
+    good &= (shape.rms < _ROUGH * sigma + _ROUGH_FLOOR) & (shape.inliers > _ONE_SURFACE)
     centres = shape.feet[good] - shape.normals[good] / shape.curvature[good][:, None]
     return Votes(centres, shape.feet[good], shape.directions[good], 1.0 / bend[good], shape.scale)
 
@@ -107,7 +120,7 @@ def hypotheses_of(votes: Votes) -> list[Hypothesis]:
         members: IntArray = np.zeros(0, np.int64)
         for _ in range(10):
             members, along = _on_line(points, directions, radii, alive, centre, direction, radius, reach)
-            members, along = _contiguous(members, along, max(0.3, 4.0 * votes.scale))
+            members, along = _contiguous(members, along, max(_GAP, 4.0 * votes.scale))
             if len(members) < _LEAST_VOTES:
                 break
             radius = float(np.median(radii[members]))
@@ -141,7 +154,7 @@ def _sector(feet: FloatArray, cylinder: Cylinder) -> Sector | None:
     radial /= np.maximum(distance, 1e-9)[:, None]
     front = radial.mean(axis=0)
     length = float(np.linalg.norm(front))
-    if length < 0.3:
+    if length < _ONE_SIDED:
         return None
     front /= length
     half = np.quantile(np.arccos(np.clip(radial @ front, -1.0, 1.0)), 0.9)

@@ -16,14 +16,32 @@ from pipeprog_detect.cloud.cylinder_fit import CylinderFit, basis, covered_arc, 
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.types import Cylinder
 
-_FIT_POINTS = 2500
-# Where a pipe goes on is seen on some of its points as well as on all.
-_FOLLOW_POINTS = 20_000
-_FINAL_POINTS = 12000
+# Points of one fit while a pipe is followed, of the search for its ends, and of the last fit; they bound the time.
+# Noise of 3 mm over the root of 2500 is 0.06 mm, less than the bend of the cloud leaves.
+_FIT_POINTS, _FOLLOW_POINTS, _FINAL_POINTS = 2500, 20_000, 12_000
+# Fewer points on a surface than this make no candidate: six for each unknown of a cylinder.
+_LEAST_POINTS = 30
+# Width of the band that counts as one standard deviation of the points about a surface: a multiple of the noise and a
+# floor [m]. Stereo's errors have longer tails than Gaussian ones (hence 1.2), and clouds are wavy by fractions of a
+# millimetre. At first the noise is the cloud's; while a pipe is followed its own, within the limits of _LEAST_BAND and
+# _MOST_BAND: surfaces seen head-on are rougher than the median one, those seen aslant smoother. The values were set
+# on generated sites; no more than their order follows from the noise.
+_START_BAND, _LEAST_BAND, _MOST_BAND = (1.2, 5e-4), (0.7, 3e-4), (1.6, 7e-4)
+_OWN_BAND = (1.2, 2e-4)
 # Noise above this share of the radius blurs half a circle into a blob whose circle fit is far too small.
 _BLURRED = 0.16
 # Clouds are bent by about a millimetre over decimetres; a fifth of that remains on the radius [m].
 _BENT_CLOUD = 2e-4
+# Of a blurred pipe: noise across the ray over the spread about the surface (a third of that along the ray for a
+# scanner, as much for a fused cloud: in between); variance of the coordinate across, in r^2 (see _by_width); least
+# share of the measured variance that the noise leaves; relative standard deviation of the radius by what part is seen.
+_BLURRED_ACROSS, _BLURRED_VARIANCE, _BLURRED_LEAST, _BLURRED_SIGMA = 0.65, 0.355, 0.25, 0.1
+# The share of the noise across is known to a third of it, that of its square to 1.5 times half of it.
+_BLURRED_NOISE_SIGMA = 1.5 * 0.5
+# A flange or a cap covers this length of an end [m], beside what the noise smears: points of it are not fitted.
+_CAP = 0.015
+# Shorter pieces of surface [m] (or than half a radius) are stray points.
+_LEAST_PIECE = 0.015
 
 
 @dataclass(frozen=True)
@@ -61,7 +79,7 @@ class Candidate:
     @property
     def band(self) -> float:
         """Width [m] that counts as one standard deviation when points are taken for its surface."""
-        return 1.2 * self.evidence.noise + 2e-4
+        return _band(self.evidence.noise, _OWN_BAND)
 
 
 def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma: float) -> Candidate | None:
@@ -70,7 +88,7 @@ def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis,
     Only the sector that voted for it is fitted: beside it a neighbour may begin, which is not known yet.
     sigma [m] is the cloud's typical noise; a pipe's own may be up to 1.6 times that (head-on surfaces, waviness).
     """
-    wide = 1.2 * sigma + 5e-4
+    wide = _band(sigma, _START_BAND)
     initial = cylinder = hypothesis.cylinder
     for turn in range(12):
         axis = cylinder.axis
@@ -81,7 +99,7 @@ def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis,
             cylinder.start - step * axis, cylinder.end + step * axis, cylinder.radius + 4.0 * wide * reach
         )
         points = _spread_out(tree.points[rows[free[rows]]], _FOLLOW_POINTS)
-        if len(points) < 30:
+        if len(points) < _LEAST_POINTS:
             return None
         grown = np.inf
         if turn:
@@ -96,7 +114,7 @@ def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis,
         fit = fit_cylinder(facing, cylinder, wide, reach=reach, along_ray=False)
         if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
             return None
-        wide = float(np.clip(1.2 * fit.rmse, 0.7 * sigma + 3e-4, 1.6 * sigma + 7e-4))
+        wide = float(np.clip(1.2 * fit.rmse, _band(sigma, _LEAST_BAND), _band(sigma, _MOST_BAND)))
         cylinder = fit.cylinder if turn == 0 else fit.cylinder.cut_like(cylinder)
         if grown < 0.02 and turn >= 2:
             break
@@ -131,7 +149,7 @@ def refit(
     cut = cylinder.cut(intervals[0].low, intervals[-1].high)
     surface = _between(near, cut, Interval(0.0, cut.length))
     surface = surface[np.abs(_signed_distance(surface, cut)) < 3.0 * wide]
-    if len(_between(surface, cut, _without_caps(cut, wide))) < 30:
+    if len(_between(surface, cut, _without_caps(cut, wide))) < _LEAST_POINTS:
         return None
     coverage = sum(interval.length for interval in intervals) / cut.length
     return Candidate(cut, radius_sigma, len(surface), _evidence(points, cut, surface, wide, coverage))
@@ -192,14 +210,14 @@ def _by_width(points: FloatArray, cylinder: Cylinder, fit: CylinderFit, wide: fl
         values, vectors = np.linalg.eigh(centred.T @ centred / len(centred))
         along = centred @ vectors[:, 2]
         near = near[np.abs(along) < 2.5 * np.sqrt(values[2])]
-    noise = 0.65 * fit.rmse
-    square = max(float(values[2]) - noise**2, 0.25 * float(values[2]))
-    radius = float(np.sqrt(square / 0.355))
+    noise = _BLURRED_ACROSS * fit.rmse
+    square = max(float(values[2]) - noise**2, _BLURRED_LEAST * float(values[2]))
+    radius = float(np.sqrt(square / _BLURRED_VARIANCE))
     again = fit_cylinder(
         _spread_out(points, _FINAL_POINTS), replace(cylinder, radius=radius), wide, reach=1.0, fixed_radius=radius
     )
     # The share of the noise across is known to a third of it; a part hidden takes up to a fifth off the width.
-    sigma = float(np.hypot(0.1 * radius, 1.5 * 0.5 * noise**2 / radius))
+    sigma = float(np.hypot(_BLURRED_SIGMA * radius, _BLURRED_NOISE_SIGMA * noise**2 / radius))
     return (again or fit), sigma
 
 
@@ -243,6 +261,12 @@ def _facing(points: FloatArray, cylinder: Cylinder, sector: Sector | None) -> Fl
     return points[radial @ sector.front > np.cos(sector.half) * np.linalg.norm(radial, axis=1)]
 
 
+def _band(noise: float, law: tuple[float, float]) -> float:
+    """Width [m] of the band for points of this noise [m]: law[0] times the noise and law[1] [m]."""
+    slope, floor = law
+    return slope * noise + floor
+
+
 def _signed_distance(points: FloatArray, cylinder: Cylinder) -> FloatArray:
     offset = points - cylinder.start
     along = offset @ cylinder.axis
@@ -254,7 +278,7 @@ def _visible_intervals(points: FloatArray, cylinder: Cylinder, wide: float) -> l
     """Stretches of the axis that show surface and lie on one line, without an elbow at an end."""
     distance = np.abs(_signed_distance(points, cylinder))
     skin = distance < 3.0 * wide
-    if skin.sum() < 30:
+    if skin.sum() < _LEAST_POINTS:
         return []
     # An elbow that leaves a narrow band shows its front only, which does not tell where it went.
     straight = straight_interval(points[distance < max(3.0 * wide, 0.2 * cylinder.radius)], cylinder, wide)
@@ -271,7 +295,7 @@ def _covered_intervals(points: FloatArray, cylinder: Cylinder, wide: float) -> l
     """Stretches between the cylinder's ends that show surface."""
     skin = points[np.abs(_signed_distance(points, cylinder)) < 3.0 * wide]
     intervals = surface_intervals(_between(skin, cylinder, Interval(0.0, cylinder.length)), cylinder)
-    return [interval for interval in intervals if interval.length > max(0.5 * cylinder.radius, 0.015)]
+    return [interval for interval in intervals if interval.length > max(0.5 * cylinder.radius, _LEAST_PIECE)]
 
 
 def _longest_gap(radius: float) -> float:
@@ -281,7 +305,7 @@ def _longest_gap(radius: float) -> float:
 
 def _connected_intervals(intervals: list[Interval], gap: float, radius: float) -> list[Interval]:
     """The intervals of one pipe: the longest one and its neighbours on either side, up to the first gap too long."""
-    intervals = [interval for interval in intervals if interval.length > max(0.5 * radius, 0.015)]
+    intervals = [interval for interval in intervals if interval.length > max(0.5 * radius, _LEAST_PIECE)]
     if not intervals:
         return []
     first = last = int(np.argmax([interval.length for interval in intervals]))
@@ -299,7 +323,7 @@ def _bridged(interval: Interval, gap: float, most: float, radius: float) -> bool
 
 
 def _without_caps(cylinder: Cylinder, wide: float) -> Interval:
-    cap = min(5.0 * wide + 0.015, 0.2 * cylinder.length)
+    cap = min(5.0 * wide + _CAP, 0.2 * cylinder.length)
     return Interval(cap, cylinder.length - cap)
 
 

@@ -12,8 +12,8 @@ from scipy.sparse.csgraph import connected_components
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
 
-# Pieces of one pipe: axes within this angle, offset by this share of the radius (and what waviness may add
-# off), radii within this ratio.
+# Pieces of one pipe: axes within 2 deg, offset by a quarter of the radius and 4 mm of waviness, radii within 12 %: half
+# the step of 25 % between standard sizes.
 _ANGLE = np.radians(2.0)
 _OFFSET = 0.25
 _RATIO = 1.12

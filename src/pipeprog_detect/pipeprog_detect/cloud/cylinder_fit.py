@@ -15,13 +15,16 @@ from pipeprog_detect.types import Cylinder
 
 # Residuals beyond this many sigmas have no weight: what lies farther off a pipe is mostly another object.
 _CUT = 3.5
+# Rounds in which the width falls to its final value, and most rounds in all.
 _ANNEALING = 8
 _MOST_ROUNDS = 40
+# Blocks along the axis for the covariance, lags of Newey and West's window (a quarter of the length), and sectors.
 _BLOCKS = 24
 _WINDOW = 6
 _SECTORS = 36
 # Mean slope of Tukey's psi at that cut under Gaussian noise: what a bias of the residual is worth in the equations.
 _SLOPE = 0.603
+# Noise tensor and cylinder are estimated in turn, three times each.
 _TENSOR_ROUNDS = 3
 
 

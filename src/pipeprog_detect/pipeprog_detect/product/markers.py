@@ -31,7 +31,7 @@ class PipeMarker:
 
 
 def pipe_markers(pipes: Sequence[Pipe], boq: BillOfQuantities) -> list[PipeMarker]:
-    """One marker a pipe, in the same order."""
+    """One marker for each pipe, in the same order."""
     colors = {planned.name: planned.color for planned in boq.classes}
     markers = []
     for pipe in pipes:

@@ -100,7 +100,7 @@ def _end(cylinder: Cylinder, which: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _between_ends(first: Pipe, second: Pipe, a: int, b: int) -> tuple[float, Joint] | None:
-    """How ill the axes meet [m], and the elbow, reducer or coupling between two ends."""
+    """The gap between the axes [m], and the elbow, reducer or coupling between two ends."""
     one, other = first.cylinder, second.cylinder
     ids = (first.id, second.id)
     (from_, out), (to, back) = _end(one, a), _end(other, b)
@@ -128,7 +128,7 @@ def _between_ends(first: Pipe, second: Pipe, a: int, b: int) -> tuple[float, Joi
 
 
 def _branch(first: Pipe, second: Pipe, a: int) -> tuple[float, Joint] | None:
-    """How ill the axes meet [m], and the tee by which an end of the first pipe branches off the second's barrel."""
+    """The gap between the axes [m], and the tee by which an end of the first pipe branches off the second's barrel."""
     branch, run = first.cylinder, second.cylinder
     end, out = _end(branch, a)
     turn = float(np.arccos(np.clip(abs(out @ run.axis), 0.0, 1.0)))
