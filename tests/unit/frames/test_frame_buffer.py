@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frames that a selector may come back to: which are held, and which of them is the sharpest."""
 
 from __future__ import annotations

@@ -195,3 +195,10 @@ def test_settings_are_checked_before_anything_starts() -> None:
             effective([text])
     with pytest.raises(InputError, match="unknown"):
         effective(["sfm.mapper.max_features=1000"], ("detect",))
+
+
+def test_trajectory_is_position_then_x_y_z_w(tmp_path: Path) -> None:
+    path = tmp_path / "trajectory.tum"
+    result_files.write_trajectory(path, [1_000_000_005], np.array([[1.0, 2.0, 3.0]]), np.array([[0.1, 0.2, 0.3, 0.9]]))
+    assert [float(word) for word in path.read_text().split()[1:]] == [1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.9]
+    assert path.read_text().split()[0] == "1.000000005"

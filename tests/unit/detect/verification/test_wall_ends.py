@@ -100,3 +100,12 @@ def test_a_pipe_through_a_shelf_with_a_view_from_below_is_not_cut(pipe_views: li
 def test_a_pipe_beside_an_edge_of_the_floor_is_not_cut(pipe_views: list[View]) -> None:
     same = with_ends_on_walls(PIPE, NO_RIMS, floor(-0.15, y_from=0.06), pipe_views, [])
     assert height_of_start(same) == pytest.approx(PIPE.start[2], abs=1e-9)
+
+
+@pytest.mark.parametrize("length", [0.5, 3.0])
+def test_without_views_a_pipe_goes_on_to_a_floor_nearer_than_half_of_the_ends_would_be(length: float) -> None:
+    """Ends come at one a length: half of them lie within ln 2 = 0.69 lengths."""
+    pipe = Cylinder(np.zeros(3), np.array([0.0, 0.0, length]), 0.04)
+    near, far = (with_ends_on_walls(pipe, NO_RIMS, floor(-share * length), [], []) for share in (0.66, 0.72))
+    assert height_of_start(near) == pytest.approx(-0.66 * length, abs=TOLERANCE)
+    assert height_of_start(far) == 0.0
