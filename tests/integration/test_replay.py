@@ -145,7 +145,7 @@ def test_every_frame_is_considered_and_the_results_are_written(tmp_path: Path) -
     assert {"/map_points", "/pipes", "/pipe_markers", "/keyframe_poses", "/sfm_status"} < set(topics)
 
 
-def test_what_a_robot_tells_of_its_motion_reaches_the_sfm(tmp_path: Path) -> None:
+def test_what_a_robot_publishes_of_its_motion_reaches_the_sfm(tmp_path: Path) -> None:
     """The replay ends well only when the SfM has heard every message."""
     process = start(tmp_path, motion=150)
     _, errors = process.communicate(timeout=60)
@@ -210,7 +210,7 @@ def test_the_nodes_end_with_a_command_that_is_killed(tmp_path: Path) -> None:
     wait_for(lambda: not any(is_running(pid) for pid in nodes.values()))
 
 
-def test_without_a_scale_the_reason_is_told_and_nothing_written(tmp_path: Path) -> None:
+def test_without_a_scale_the_reason_is_reported_and_nothing_written(tmp_path: Path) -> None:
     process = start(tmp_path, fault="no scale")
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1

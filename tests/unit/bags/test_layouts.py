@@ -75,7 +75,7 @@ def test_boards_are_printed_as_badly_as_asked_and_nothing_else_moves() -> None:
     assert printed[0].lamps == exact.lamps
 
 
-def test_a_bill_plans_a_quarter_more_than_is_there() -> None:
+def test_a_boq_plans_a_quarter_more_than_is_there() -> None:
     site = lab(1)
     planned = site.planned_lengths()
     assert list(planned) == list(LAB_RADII)

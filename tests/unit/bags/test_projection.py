@@ -71,7 +71,7 @@ def test_a_developed_circle_stays_where_it_is() -> None:
 
 
 @pytest.mark.parametrize(("radius", "roll"), [(0.0086, 0.02), (0.0575, -0.05), (0.1223, 0.0)])
-def test_outlines_of_cylinders_are_their_tangent_planes(radius: float, roll: float) -> None:
+def test_apparent_contours_of_cylinders_lie_in_tangent_planes(radius: float, roll: float) -> None:
     # Upright, so that it is equally bright all round; the camera is tilted instead.
     pose = look([0.1, -1.6, 1.0], 0.1, 0.08, roll)[0]
     start, end = np.array([0.0, -0.2, -1.0]), np.array([0.0, -0.2, 3.0])

@@ -77,7 +77,7 @@ def test_truth_has_the_agreed_members(recording: Path) -> None:
         assert pipe["radius"] in truth["planned_radii"]
 
 
-def test_bill_and_board_read_as_yaml(recording: Path) -> None:
+def test_boq_and_board_read_as_yaml(recording: Path) -> None:
     boq = yaml.safe_load(recording.with_suffix(".boq.yaml").read_text())
     assert [c["outer_radius_mm"] for c in boq["classes"]] == [8.6, 36.5, 57.5, 84.1, 109.5]
     assert all(c["planned_length_m"] > 0 for c in boq["classes"])

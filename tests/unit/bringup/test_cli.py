@@ -180,7 +180,7 @@ def test_detect_score_report_and_board_work_without_ros(folder: Path) -> None:
     assert (folder / "report.html").exists()
 
 
-def test_a_full_disk_is_told_and_leaves_nothing(folder: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing(folder: Path) -> None:
     """The second file fails to be written, as it would on a full disk."""
     code = (
         "import errno, pathlib, sys\n"

@@ -63,11 +63,11 @@ def test_three_points_stay_as_they_are(tmp_path: Path) -> None:
         ("1:5,5:30,20", "KEYFRAME:u1,v1,u2,v2"),
     ],
 )
-def test_what_is_no_line_on_a_keyframe_is_told(run: Path, plane: str, why: str) -> None:
+def test_what_is_no_line_on_a_keyframe_is_reported(run: Path, plane: str, why: str) -> None:
     with pytest.raises(InputError, match=why):
         as_points(plane, run)
 
 
-def test_a_line_without_a_survey_is_told(tmp_path: Path) -> None:
+def test_a_line_without_a_survey_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no trajectory\.tum"):
         as_points("1:5,5,30,20", tmp_path)

@@ -151,7 +151,7 @@ def test_an_empty_room_has_no_pipes() -> None:
     assert detect(Cloud(wall + rng.normal(0.0, NOISE, wall.shape)), BOQ, CONFIG) == []
 
 
-def test_progress_is_told_and_ends_at_one() -> None:
+def test_progress_is_reported_and_ends_at_one() -> None:
     told: list[float] = []
     detect(Cloud(scene()[::4]), BOQ, CONFIG, progress=lambda share, _: told.append(share))
     assert told == sorted(told)

@@ -300,7 +300,7 @@ def test_from_outside_a_hollow_is_no_pipe_and_from_inside_a_pipe_is_none() -> No
     assert detect(cloud, planned, CONCAVE) == []
 
 
-def test_an_empty_sewer_tells_nothing() -> None:
+def test_stray_points_are_no_sewer() -> None:
     stray = np.random.default_rng(1).uniform(-1.0, 1.0, (5000, 3))
     assert detect(Cloud(stray), SEWERS, CONCAVE) == []
 

@@ -192,7 +192,7 @@ def test_an_image_that_comes_twice_takes_no_keyframe_back(stage: Callable[..., S
     assert not scene.retired
 
 
-def test_live_a_lagging_sfm_gets_fewer_keyframes_and_people_are_told(
+def test_live_a_lagging_sfm_gets_fewer_keyframes_and_diagnostics_say_so(
     stage: Callable[..., Stage], wall: NDArray
 ) -> None:
     scene = stage()

@@ -36,7 +36,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def test_nodes_are_told_apart_by_name_and_namespace(make_node: Callable[..., Node]) -> None:
+def test_nodes_are_distinguished_by_name_and_namespace(make_node: Callable[..., Node]) -> None:
     frames = make_node("frames")
     for name, namespace in (("rviz", "/"), ("sfm", "/other_robot"), ("sfm", "/")):
         node = make_node(name, namespace)

@@ -68,12 +68,12 @@ def test_16_bits_are_scaled_whatever_the_sensor_uses_of_them(is_bigendian: bool)
 
 
 @pytest.mark.parametrize("encoding", ["32FC1", "yuv422", ""])
-def test_unknown_encoding_is_told(encoding: str) -> None:
+def test_unknown_encoding_is_reported(encoding: str) -> None:
     with pytest.raises(InputError, match=f"'{encoding}'.*bgr8"):
         messages.image_from_msg(image(encoding, GREY))
 
 
-def test_image_with_too_few_bytes_is_told() -> None:
+def test_image_with_too_few_bytes_is_reported() -> None:
     message = image("bgr8", COLOR)
     message.data = message.data[:-1]
     with pytest.raises(InputError, match="damaged image: 6 x 4 bgr8"):
@@ -109,7 +109,7 @@ def test_camera_goes_there_and_back(model: str, distortion: tuple[float, ...]) -
         ({"binning_x": 2}, "binning 2"),
     ],
 )
-def test_camera_that_cannot_be_used_is_told(change: dict[str, object], text: str) -> None:
+def test_camera_that_cannot_be_used_is_reported(change: dict[str, object], text: str) -> None:
     message = messages.info_from_camera(Camera(1280, 720, 900.0, 901.0, 639.5, 359.5), 0, "camera")
     for name, value in change.items():
         setattr(message, name, value)
@@ -117,7 +117,7 @@ def test_camera_that_cannot_be_used_is_told(change: dict[str, object], text: str
         messages.camera_from_info(message)
 
 
-def test_driver_that_leaves_camera_info_empty_is_told() -> None:
+def test_empty_camera_info_of_a_driver_is_reported() -> None:
     with pytest.raises(InputError, match="set width and height"):
         messages.camera_from_info(CameraInfo())
 
@@ -188,7 +188,7 @@ def test_padded_big_endian_cloud_is_read() -> None:
     np.testing.assert_array_equal(messages.points_from_cloud(message)[0], np.tile([1.0, 2.0, 3.0], (3, 1)))
 
 
-def test_cloud_that_cannot_be_used_is_told() -> None:
+def test_cloud_that_cannot_be_used_is_reported() -> None:
     message = messages.point_cloud(messages.header(0, "map"), np.zeros((4, 3)))
     message.fields[2].name = "intensity"
     with pytest.raises(InputError, match="x, y, intensity: x, y and z are needed"):

@@ -75,7 +75,7 @@ def test_overrides_reach_the_dataclass_and_the_parameters() -> None:
         ({"front_end": "magic"}, "none of its choices: normals, planes"),
     ],
 )
-def test_overrides_that_cannot_be_used_are_told(overrides: dict[str, object], text: str) -> None:
+def test_overrides_that_cannot_be_used_are_reported(overrides: dict[str, object], text: str) -> None:
     node = node_with(overrides)
     with pytest.raises(InputError, match=text):
         declare(node, Config, extra=("board",))
@@ -103,7 +103,7 @@ run(Tested)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_node_that_is_told_to_stop_exits_with_0(number: signal.Signals) -> None:
+def test_node_that_is_stopped_exits_with_0(number: signal.Signals) -> None:
     program = PROGRAM.format(body="self.create_timer(0.01, lambda: print('up', flush=True))")  # says that it spins
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -121,7 +121,7 @@ def test_mistake_of_the_user_is_one_line_and_exit_1() -> None:
     assert (process.returncode, process.stderr) == (1, "error: no bill of quantities: set boq\n")
 
 
-def test_parameter_file_that_is_not_there_is_told_without_traceback() -> None:
+def test_missing_parameter_file_is_reported_without_traceback() -> None:
     program = PROGRAM.format(body="pass")
     arguments = ["--ros-args", "--params-file", "missing.yaml"]
     process = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=20)

@@ -96,7 +96,7 @@ def test_unknown_name_like_no_other_lists_all() -> None:
         ("baseline", 10.0, "out of range: 0 to 9 m"),
     ],
 )
-def test_values_that_do_not_fit_are_told(name: str, value: object, text: str) -> None:
+def test_values_out_of_range_are_reported(name: str, value: object, text: str) -> None:
     with pytest.raises(InputError, match=text) as error:
         build(Config, {name: value})
     assert name in str(error.value)
@@ -124,6 +124,6 @@ def test_text_is_parsed_by_type(text: str, name: str, value: object) -> None:
     ("text", "name"),
     [("many", "stereo.max_pairs"), ("2.5", "stereo.max_pairs"), ("maybe", "lockstep"), ("", "overlap_min")],
 )
-def test_text_of_another_type_is_told(text: str, name: str) -> None:
+def test_text_of_another_type_is_reported(text: str, name: str) -> None:
     with pytest.raises(InputError, match=f"{name} = '{text}'"):
         parse(text, SETTINGS[name])

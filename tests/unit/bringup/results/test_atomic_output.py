@@ -129,7 +129,7 @@ def test_a_place_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
             pass
 
 
-def test_a_full_disk_is_told_as_such(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_as_such(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no space left"), OutputFolder(tmp_path / "results"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert names(tmp_path) == []

@@ -171,7 +171,7 @@ def test_frames_of_one_stamp_each_get_a_decision() -> None:
     assert log.common_reasons() == "1 x stamp repeats"
 
 
-def test_faults_are_told_apart_from_frames_that_nobody_needs() -> None:
+def test_faulty_frames_are_distinguished_from_frames_not_needed() -> None:
     log = FrameLog()
     for stamp, reason in ((1, "overlap suffices"), (2, "damaged image"), (3, "damaged image")):
         log.play(stamp)

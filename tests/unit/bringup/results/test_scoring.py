@@ -186,7 +186,7 @@ def test_alignment_finds_the_motion_and_the_scale(seed: int, scale: float, strai
         np.testing.assert_allclose(trajectory.world_from_map @ map_from_world, np.eye(4), atol=1e-7)
 
 
-def test_position_noise_is_told_as_its_rms() -> None:
+def test_position_noise_is_reported_as_its_rms() -> None:
     true = poses(2000, 5)
     noisy = true.copy()
     noisy[:, :3, 3] += np.random.default_rng(1).normal(0, 0.001, (2000, 3))

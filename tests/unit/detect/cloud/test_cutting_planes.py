@@ -36,7 +36,7 @@ def half_pipe(pipe: Cylinder, per_square_metre: int = 80_000, seed: int = 0) -> 
 
 
 def leaning(x: float, radius: float, degrees: float) -> Cylinder:
-    """A pipe through (x, 0, 0.5), 0.8 m long, off the upright by so much."""
+    """A pipe through (x, 0, 0.5), 0.8 m long, `degrees` off the upright."""
     half = 0.4 * np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
     middle = np.array([x, 0.0, 0.5])
     return Cylinder(middle - half, middle + half, radius)
@@ -103,6 +103,6 @@ def test_three_points_make_a_plane_and_several_are_parted() -> None:
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "a,b,c 1,2,3 4,5,6", "0,0,0 1,1,1 2,2,2", "0,0,0 0,0,1 nan,1,0", "1 2 3"])
-def test_what_is_no_plane_is_told(text: str) -> None:
+def test_what_is_no_plane_is_reported(text: str) -> None:
     with pytest.raises(InputError, match="plane"):
         parse_planes(text)

@@ -48,7 +48,7 @@ def test_points_near_a_segment_are_all_found(seed: int, distance: float) -> None
     np.testing.assert_array_equal(tree.near_segment(start, end, distance), expected)
 
 
-def test_the_order_of_the_points_is_lost() -> None:
+def test_the_order_of_the_points_does_not_matter() -> None:
     given_points = np.concatenate([points(3), points(3)[:50] + 1e-7])
     shuffled = given_points[np.random.default_rng(4).permutation(len(given_points))]
     np.testing.assert_array_equal(octree.build(given_points).points, octree.build(shuffled).points)

@@ -107,7 +107,7 @@ def test_standard_sizes(tmp_path: Path, size: str, diameter_mm: float) -> None:
         ),
     ],
 )
-def test_a_wrong_bill_is_told_what_to_mend(tmp_path: Path, text: str, told: str) -> None:
+def test_a_wrong_boq_is_reported_with_its_remedy(tmp_path: Path, text: str, told: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         load_boq(path)
@@ -120,6 +120,6 @@ def test_a_wall_is_for_cameras_inside(tmp_path: Path) -> None:
     assert planned.bores == ((pytest.approx(0.0941), planned.tolerance),)
 
 
-def test_a_missing_bill_names_its_path(tmp_path: Path) -> None:
+def test_a_missing_boq_is_reported_with_its_path(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.yaml: cannot read"):
         load_boq(tmp_path / "none.yaml")

@@ -76,7 +76,7 @@ RADII = st.lists(st.floats(0.005, 0.2), min_size=1, max_size=20)
 
 
 @given(radii=RADII, nominal=RADII)
-def test_kmeans_settles(radii: list[float], nominal: list[float]) -> None:
+def test_kmeans_converges(radii: list[float], nominal: list[float]) -> None:
     """In the end no pipe is nearer to the mean of another class that has pipes than to that of its own."""
     labels = np.array(by_kmeans(radii, nominal))
     classes, own = np.unique(labels, return_inverse=True)
@@ -109,7 +109,7 @@ def test_sewers_are_classed_by_their_bore(diameter_mm: int) -> None:
     assert classify(0.110, 0.0003, sewers, concave=True).name is None
 
 
-def test_a_wall_that_the_bill_gives_is_taken() -> None:
+def test_a_wall_thickness_that_the_boq_gives_is_used() -> None:
     thick = BillOfQuantities(tuple(replace(each, wall=0.01) for each in boq(0.1, 0.11).classes))
     assert classify(0.1, 0.0002, thick, concave=True).name == "110"
 

@@ -89,7 +89,7 @@ def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
     assert refine(Start(above, 0.004), empty_views, []) is None
 
 
-def test_support_tells_a_pipe_from_a_guess(pipe_views: list[View], empty_views: list[View]) -> None:
+def test_a_wrong_radius_and_an_empty_wall_have_no_support(pipe_views: list[View], empty_views: list[View]) -> None:
     thick = Cylinder(PIPE.start, PIPE.end, 1.2 * PIPE.radius)
     assert Scene.of(PIPE, pipe_views, []).support().share > 0.9
     assert Scene.of(thick, pipe_views, []).support().share < 0.2

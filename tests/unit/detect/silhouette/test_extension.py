@@ -19,7 +19,7 @@ SAMPLES_TOLERANCE = 0.03  # the contour alone tells an end to two samples of 6 p
 
 
 @pytest.mark.parametrize("piece", [(0.0, 0.16), (0.12, 0.28), (0.24, 0.4)])
-def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[float, float]) -> None:
+def test_a_short_cylinder_is_extended_to_the_whole_pipe(pipe_views: list[View], piece: tuple[float, float]) -> None:
     low, high = (PIPE.start + place * PIPE.axis for place in piece)
     fit = refine(Start(Cylinder(low, high, PIPE.radius), 0.002), pipe_views, [])
     assert fit is not None
@@ -33,7 +33,7 @@ def test_a_piece_grows_to_the_whole_pipe(pipe_views: list[View], piece: tuple[fl
 
 @pytest.mark.parametrize("length", [0.05, 0.06])
 @pytest.mark.parametrize("place", [0.0, 0.1, 0.2, 0.3])
-def test_a_piece_too_short_to_tell_its_direction_grows_in_the_one_that_its_edges_ahead_tell(
+def test_a_cylinder_too_short_for_a_direction_is_extended_along_the_edges_ahead(
     pipe_views: list[View], length: float, place: float
 ) -> None:
     random = np.random.default_rng(0)

@@ -17,7 +17,7 @@ END_TOLERANCE = 1.2e-3
 
 @pytest.mark.parametrize("at_end", [False, True])
 @pytest.mark.parametrize("error", [-0.04, 0.0, 0.03])
-def test_rim_is_found(pipe_views: list[View], at_end: bool, error: float) -> None:
+def test_end_rim_is_found(pipe_views: list[View], at_end: bool, error: float) -> None:
     axis = PIPE.axis
     start = PIPE.start - (0.0 if at_end else error) * axis
     end = PIPE.end + (error if at_end else 0.0) * axis
@@ -55,7 +55,7 @@ def test_the_edge_of_what_hides_a_pipe_is_not_its_end(pipe_views: list[View]) ->
     assert found.position == pytest.approx(0.0, abs=END_TOLERANCE)
 
 
-def test_a_rim_speaks_for_an_end(pipe_views: list[View]) -> None:
+def test_an_end_rim_raises_the_odds_of_an_end(pipe_views: list[View]) -> None:
     found = find_end(Scene.of(PIPE, pipe_views, []), True, None)
     assert found is not None
     assert found.odds > 1.0

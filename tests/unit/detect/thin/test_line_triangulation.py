@@ -22,7 +22,7 @@ def cloud(*pipes: Cylinder) -> np.ndarray:
     return np.concatenate([wall_points(), *(front_points(pipe) for pipe in pipes)]).astype(np.float32)
 
 
-def test_edges_of_a_band_make_one_ribbon() -> None:
+def test_edges_of_a_band_make_one_segment_pair() -> None:
     image = np.full((200, 300), 90, np.uint8)
     image[:, 140:152] = 180
     edges = straight_edges(image)
@@ -34,7 +34,7 @@ def test_edges_of_a_band_make_one_ribbon() -> None:
     assert len(segment_pairs(edges, 15.0, 20.0)) == 0
 
 
-def test_pieces_of_one_edge_are_joined_and_a_blank_image_has_none() -> None:
+def test_segments_of_one_edge_are_joined_and_a_blank_image_has_none() -> None:
     image = np.full((200, 300), 90, np.uint8)
     image[20:90, 140:] = 180
     image[110:180, 140:] = 180

@@ -10,7 +10,7 @@ from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined
 
 
-def test_a_piece_found_by_its_lines_is_one_pipe_with_that_of_the_cloud() -> None:
+def test_a_pipe_found_by_its_lines_and_in_the_cloud_is_one() -> None:
     """As thick as the better measured one; another pipe on its line, too far on, stays one of its own."""
 
     def piece(low: float, high: float, radius_sigma: float, points: int) -> MeasuredPipe:

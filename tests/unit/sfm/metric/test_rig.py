@@ -74,7 +74,7 @@ def test_sigma_of_a_rig_is_honest():
     assert np.mean(sigmas) < 0.004
 
 
-def test_single_poses_that_are_wrong_do_no_harm():
+def test_single_wrong_poses_leave_the_scale():
     pair = Pair(2, noise=0.0005)
     for stamp in list(pair.poses)[4:20:6]:
         pair.poses[stamp] = pair.poses[stamp].copy()

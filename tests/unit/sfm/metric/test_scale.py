@@ -134,7 +134,7 @@ def test_equal_boards_at_both_ends_of_a_walk_are_told_apart():
     assert estimate.scale * walk.factor == pytest.approx(1.0, abs=5e-4)
 
 
-def test_an_image_with_a_wrong_pose_does_no_harm():
+def test_an_image_with_a_wrong_pose_leaves_the_scale():
     walk = Walk(6, views=10, noise=0.03, pose_noise=0.0003)
     walk.poses[4][:3, 3] += 0.09 * walk.factor
     estimate = told(walk)

@@ -162,7 +162,7 @@ def test_sigma_of_odometry_is_honest():
     assert 0.01 <= stretched.sigma < 0.011
 
 
-def test_a_slip_does_no_harm():
+def test_a_wheel_slip_leaves_the_scale():
     robot = Robot(2)
     path = path_of(robot, noise=0.002)
     slipped = path.fixed_from_camera.copy()

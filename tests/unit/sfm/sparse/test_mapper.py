@@ -109,7 +109,7 @@ def test_a_loop_is_closed_though_the_map_has_drifted() -> None:
     assert np.degrees(np.arccos((np.trace(relative[:3, :3]) - 1) / 2)) < 0.1, "the 41st looks where the first did"
 
 
-def test_a_keyframe_of_elsewhere_waits_and_says_why() -> None:
+def test_a_keyframe_of_elsewhere_waits_with_a_reason() -> None:
     mapper = Mapper(MapperConfig())
     for n in range(4):
         mapper.add_features(n * STEP, view(pose(0.2 * n), n), CAMERA)

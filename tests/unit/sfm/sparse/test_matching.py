@@ -28,7 +28,7 @@ def test_match_finds_a_permutation() -> None:
     assert (order[found[:, 1]] == found[:, 0]).all()
 
 
-def test_match_refuses_strangers_and_twins() -> None:
+def test_match_refuses_unrelated_and_ambiguous_features() -> None:
     looks = descriptors(0)
     assert len(match(root_sift(looks), root_sift(descriptors(9)))) == 0
     assert len(match(noisy(looks, 2), root_sift(np.concatenate([looks, looks])))) == 0
