@@ -83,7 +83,7 @@ MUTANTS = {
         "pipeprog_camera.camera.Camera.scaled",
         "(self.cx + 0.5) * factor - 0.5",
         "self.cx * factor",
-        "frames/test_camera.py",
+        "camera/test_camera.py",
     ),
     "dense: depths fused without the scale": Mutant(
         "pipeprog_sfm.dense.depth_fusion.Fusion.add",

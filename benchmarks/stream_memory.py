@@ -24,8 +24,8 @@ from benchmarks.selector_cost import enlarged
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.decoding import decode_reduced
-from pipeprog_frames.feedback import OverlapReport
 from pipeprog_frames.frame_buffer import EncodedFrame, FrameRing
+from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.stream import KeyframeStream
 
 RESULTS = Path(__file__).parent / "results"

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pipeprog
-from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.scale import Measurement, ScaleEstimate, ScaleWarning
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.scale_sources import SOURCES
 
 TRUE_SCALE = 2.5  # metres per unit of the simulated model

@@ -16,9 +16,9 @@ import pytest
 import typer
 
 from pipeprog_bringup.cli import app
-from pipeprog_bringup.results.overrides import effective
 from pipeprog_bringup.results.result_files import FRAME_COLUMNS
 from pipeprog_bringup.results.scoring import Result, Segment, Truth, align, score
+from pipeprog_bringup.results.setting_overrides import effective
 from pipeprog_camera.errors import InputError
 
 ROOT = Path(__file__).parents[2]

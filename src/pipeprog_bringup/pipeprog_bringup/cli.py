@@ -113,7 +113,7 @@ def detect(
     """Find and classify the pipes of a metric point cloud."""
     from pipeprog_bringup.console import print_progress, share_bar
     from pipeprog_bringup.detect_cloud import detect_file
-    from pipeprog_bringup.keyframe_plane import as_points
+    from pipeprog_bringup.plane_from_keyframe import as_points
 
     cut = [] if plane is None else ["detect.front_end=planes", f"detect.plane={as_points(plane, cloud.parent)}"]
     with share_bar("detect") as report:

@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import read_cloud
-from pipeprog_bringup.results.overrides import effective
+from pipeprog_bringup.results.setting_overrides import effective
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 
-from pipeprog_bringup.results.overrides import NODE_CONFIGS
+from pipeprog_bringup.results.setting_overrides import NODE_CONFIGS
 from pipeprog_node.settings import Setting, describe
 
 _HEAD = """\

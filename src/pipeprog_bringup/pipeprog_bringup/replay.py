@@ -22,7 +22,7 @@ from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
-from pipeprog_bringup.results.overrides import as_parameters, effective
+from pipeprog_bringup.results.setting_overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.product import Product

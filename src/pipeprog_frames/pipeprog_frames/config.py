@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeprog_camera.setting import setting
+from pipeprog_camera.setting_field import setting
 
 
 @dataclass(frozen=True)

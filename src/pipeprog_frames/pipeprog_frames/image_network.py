@@ -7,8 +7,8 @@ from bisect import insort
 from collections.abc import Iterable
 
 from pipeprog_frames.corners import corners
-from pipeprog_frames.decision import DAMAGED, Decision, Load
-from pipeprog_frames.feedback import MIN_RUN, BestBetween, OverlapReport
+from pipeprog_frames.frame_decision import DAMAGED, Decision, Load
+from pipeprog_frames.overlap_feedback import MIN_RUN, BestBetween, OverlapReport
 from pipeprog_frames.tracker import MIN_CORNERS
 
 START_PERIOD = 2_000_000_000  # ns: 0.5 frames a second

@@ -16,13 +16,13 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_frames.acknowledgements import MAX_AHEAD, Answer, Ledger
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decision import DAMAGED, Decision, Load
 from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
-from pipeprog_frames.feedback import OverlapReport
 from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
-from pipeprog_frames.ledger import MAX_AHEAD, Answer, Ledger
-from pipeprog_frames.policy import Policy, make_policy
+from pipeprog_frames.frame_decision import DAMAGED, Decision, Load
+from pipeprog_frames.overlap_feedback import OverlapReport
+from pipeprog_frames.selection_policy import Policy, make_policy
 from pipeprog_frames.stream import KeyframeStream
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_msgs.srv import Finish

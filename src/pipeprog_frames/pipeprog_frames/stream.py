@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decision import Decision, Load
-from pipeprog_frames.feedback import BestBetween, OverlapReport, StreamFeedback
+from pipeprog_frames.frame_decision import Decision, Load
+from pipeprog_frames.overlap_feedback import BestBetween, OverlapReport, StreamFeedback
 from pipeprog_frames.selector import FrameSelector
 
 UNLOADED_LAG = 5  # keyframes that the SfM may be behind without load: a bundle adjustment takes seconds at times

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from pipeprog_bringup.parameters_doc import markdown
-from pipeprog_bringup.results.overrides import NODE_CONFIGS
+from pipeprog_bringup.results.setting_overrides import NODE_CONFIGS
 from pipeprog_node.settings import build, flatten
 
 ROOT = Path(__file__).parents[3]

@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeprog_frames.decision import Decision
-from pipeprog_frames.feedback import OverlapReport, StreamFeedback
+from pipeprog_frames.frame_decision import Decision
 from pipeprog_frames.image_network import START_PERIOD, ImageNetwork
+from pipeprog_frames.overlap_feedback import OverlapReport, StreamFeedback
 
 FEATURES = 2000
 FPS = 30

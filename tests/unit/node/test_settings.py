@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.setting import setting
+from pipeprog_camera.setting_field import setting
 from pipeprog_node.settings import build, describe, flatten, parse
 
 

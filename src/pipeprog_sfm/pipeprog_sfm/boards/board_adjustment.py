@@ -19,7 +19,7 @@ from pipeprog_sfm.boards.board_covariance import (
     variance_components,
 )
 from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, PosedCamera
-from pipeprog_sfm.boards.triangulation import cross_matrices
+from pipeprog_sfm.boards.rays import cross_matrices
 
 VARIANCE_ROUNDS = 4  # each halves the distance of the variance components from their limit, or better
 MAX_STEPS = 6  # Gauss-Newton steps of a round, from a start that triangulation gives to 1 % of the size

@@ -23,7 +23,7 @@ from pipeprog_sfm.boards.board_covariance import PRIOR_CENTRE, PRIOR_POSE
 from pipeprog_sfm.boards.board_detection import detect_predicted_board
 from pipeprog_sfm.boards.ellipses import ImageEllipses
 from pipeprog_sfm.boards.placed_board import BoardView, CircleRows, PlacedBoard, PosedCamera
-from pipeprog_sfm.boards.triangulation import MIN_SINE, midpoints
+from pipeprog_sfm.boards.rays import MIN_SINE, midpoints
 
 START_IMAGES = 40  # images that start a pair, spread over all: enough that some see the board well
 PARTNER_IMAGES = 6  # images that each of them is paired with, near to far

@@ -21,7 +21,7 @@ from pipeprog_sfm.boards.board_triangulation import place_circle
 from pipeprog_sfm.boards.conic import circles_from_conics, conic_score
 from pipeprog_sfm.boards.ellipses import ImageEllipses
 from pipeprog_sfm.boards.placed_board import PlacedBoard, PosedCamera
-from pipeprog_sfm.boards.triangulation import MIN_SINE, midpoints
+from pipeprog_sfm.boards.rays import MIN_SINE, midpoints
 
 SAME_CONIC = 0.1  # conic score up to which two ellipses may show one disc; see conic_score
 # Distance, px, of the triangulated centre from the ellipses' centres: the larger of 3 px, which poses may err by, and

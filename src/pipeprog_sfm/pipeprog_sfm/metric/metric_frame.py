@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
-from pipeprog_sfm.metric.evidence import PosedEvidence
 from pipeprog_sfm.metric.map_frame import Vertical, map_from_model
 from pipeprog_sfm.metric.scale import (
     Combined,
@@ -16,6 +15,7 @@ from pipeprog_sfm.metric.scale import (
     ScaleWarning,
     combine,
 )
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.vertical_from_planes import PlanesError
 from pipeprog_sfm.metric.vertical_sources import VERTICAL_SOURCES, floor_and_walls

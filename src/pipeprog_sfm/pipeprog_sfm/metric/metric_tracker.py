@@ -15,9 +15,9 @@ from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.ellipses import ImageEllipses, detect_ellipses
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
-from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.scale import NoScaleError, PoseCovariance, ScaleEstimate
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, TransformTree
 

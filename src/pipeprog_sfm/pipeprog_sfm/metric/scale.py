@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.placed_board import PlacedBoard
-from pipeprog_sfm.boards.triangulation import cross_matrices
+from pipeprog_sfm.boards.rays import cross_matrices
 
 # Covariance (S, S) of S functions of the poses, given their (S, N, 6) derivatives, poses in order of time.
 PoseCovariance = Callable[[FloatArray], FloatArray]

@@ -19,12 +19,12 @@ from pipeprog_sfm.boards.board_adjustment import PlacementSensitivity, placement
 from pipeprog_sfm.boards.board_file import KnownDistance
 from pipeprog_sfm.boards.ellipses import ImageEllipses
 from pipeprog_sfm.boards.placed_board import PlacedBoard
+from pipeprog_sfm.boards.rays import cross_matrices
 from pipeprog_sfm.boards.scale_bar import ScaleBarError, find_scale_bar
-from pipeprog_sfm.boards.triangulation import cross_matrices
-from pipeprog_sfm.metric.evidence import PosedEvidence
 from pipeprog_sfm.metric.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.metric.rig import rig_measurements
 from pipeprog_sfm.metric.scale import Measurement, ScaleWarning
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence
 from pipeprog_sfm.metric.transform_tree import NoPathError
 
 PlacedWithSensitivity = tuple[PlacedBoard, PlacementSensitivity]

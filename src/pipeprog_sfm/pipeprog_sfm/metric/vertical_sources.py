@@ -8,10 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
-from pipeprog_sfm.metric.evidence import PosedEvidence
 from pipeprog_sfm.metric.gravity import GravityError, gravity
 from pipeprog_sfm.metric.map_frame import Vertical, board_vertical, camera_up, path_vertical
 from pipeprog_sfm.metric.scale import ScaleWarning
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence
 from pipeprog_sfm.metric.transform_tree import NoPathError
 from pipeprog_sfm.metric.vertical_from_planes import vertical_from_planes
 

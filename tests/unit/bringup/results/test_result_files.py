@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
-from pipeprog_bringup.results.overrides import as_parameters, effective
 from pipeprog_bringup.results.result_files import Scale
+from pipeprog_bringup.results.setting_overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun

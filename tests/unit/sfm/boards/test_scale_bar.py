@@ -14,9 +14,9 @@ from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile, ScaleBar
 from pipeprog_sfm.config import BoardConfig
-from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.scale import NoScaleError
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 
 CONFIG = BoardConfig()
 RADIUS, SIGMA = 0.05, 0.001

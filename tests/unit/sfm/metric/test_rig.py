@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from targets import CAMERA
 
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
-from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.rig import rig_measurements
 from pipeprog_sfm.metric.scale import ScaleWarning
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.transform_tree import Transform, TransformTree
 from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
 from tests.unit.sfm.metric.test_transform_tree import SECOND, Robot, pose_of, random_pose

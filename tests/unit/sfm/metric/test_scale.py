@@ -14,10 +14,10 @@ from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile, KnownDistance
 from pipeprog_sfm.boards.placed_board import PosedCamera
 from pipeprog_sfm.config import BoardConfig
-from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import Measurement, NoScaleError, ScaleWarning
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.scale_sources import SOURCES
 from pipeprog_sfm.metric.vertical_from_planes import PlanesError, vertical_from_planes
 from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covariance

@@ -12,11 +12,11 @@ from targets import CAMERA
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import OdometryConfig
-from pipeprog_sfm.metric.evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.gravity import STANDARD_GRAVITY, GravityError, gravity
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.odometry import OdometryError, odometry_measurement
 from pipeprog_sfm.metric.scale import NoScaleError
+from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.transform_tree import Acceleration, CameraPath, NoPathError, Transform, TransformTree
 
 SECOND = 1_000_000_000

@@ -7,7 +7,7 @@ from bisect import bisect_left, insort
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
-from pipeprog_frames.decision import Decision
+from pipeprog_frames.frame_decision import Decision
 
 MIN_GAIN = 0.01  # of overlap, by an added frame; with less, the next frame would not help either
 MAX_BRIDGES = 3  # frames added on each side of an unregistered image: the third is at an eighth of the gap

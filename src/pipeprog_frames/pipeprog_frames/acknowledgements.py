@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pipeprog_frames.feedback import OverlapReport
+from pipeprog_frames.overlap_feedback import OverlapReport
 
 MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
 

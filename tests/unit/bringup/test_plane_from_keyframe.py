@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pipeprog_bringup.keyframe_plane import as_points
+from pipeprog_bringup.plane_from_keyframe import as_points
 from pipeprog_bringup.results.result_files import write_trajectory
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from pipeprog_frames.limits import KeyframeLimits
+from pipeprog_frames.keyframe_limits import KeyframeLimits
 from pipeprog_frames.tracker import Track
 
 MAX_UNSEEN = 200_000_000  # ns between two looks: a turn of 90 degrees a second moves by 18, within the tracker's reach
 
 
-class LookSchedule:
+class DecodeSchedule:
     """The time of the next look, by the speed at which the limits have been approached since the last keyframe."""
 
     def __init__(self, limits: KeyframeLimits) -> None:

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from pipeprog_frames.feedback import OverlapReport
-from pipeprog_frames.ledger import MAX_AHEAD, Answer, Ledger
+from pipeprog_frames.acknowledgements import MAX_AHEAD, Answer, Ledger
+from pipeprog_frames.overlap_feedback import OverlapReport
 
 
 def answer(stamp: int, keyframes: int, retirements: int = 0) -> Answer:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.similarity import similarity
-from pipeprog_sfm.boards.triangulation import cross_matrices, midpoints
+from pipeprog_sfm.boards.rays import cross_matrices, midpoints
 
 
 @settings(max_examples=10, deadline=None)
