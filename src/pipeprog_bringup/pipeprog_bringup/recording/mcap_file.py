@@ -149,6 +149,7 @@ class McapFile:
                 # Zeros or noise behind the last record are a tear as well: after a power loss a file system may keep
                 # the length of a file without its data.
                 self.torn_at = size if opcode == Opcode.CHUNK else position
+                self._drop_unwritten(stream, position)
                 return
             if opcode == Opcode.FOOTER:
                 stream.seek(end)
@@ -160,10 +161,7 @@ class McapFile:
                 return
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and data_section:
                 self._register(opcode, stream.read(length))
-            elif opcode in (
-                Opcode.SCHEMA,
-                Opcode.CHANNEL,
-            ):  # of a file that ends well: a tear may run through its summary
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):  # believed if the file ends well: a tear may run through it
                 summary.append((opcode, stream.read(length)))
             elif opcode == Opcode.MESSAGE and data_section and length >= 22:
                 channel_id, _, log_time = struct.unpack("<HIQ", stream.read(14))
@@ -176,6 +174,15 @@ class McapFile:
             elif opcode == Opcode.DATA_END:
                 data_section = False
             position = end
+
+    def _drop_unwritten(self, stream: BinaryIO, torn_at: int) -> None:
+        """Forget a single message before the tear whose data is all zeros: the tear may run through its log time."""
+        block = self._blocks[-1] if self._blocks else None
+        if block is not None and not block.in_chunk and block.offset + block.size == torn_at:
+            stream.seek(block.offset + 9 + 22)
+            if not any(stream.read(block.size - 9 - 22)):
+                self._blocks.pop()
+                self.torn_at = block.offset
 
     def _add_chunk(self, stream: BinaryIO, position: int, end: int, whole: bool) -> None:
         head = stream.read(32)

@@ -54,6 +54,7 @@ def test_reads_the_frames_in_order_with_their_calibration(tmp_path: Path) -> Non
 @given(st.sampled_from(sorted(LAYOUTS)), st.floats(0, 1), st.booleans())
 @example("lz4", 0.00116, True)  # zeros from the length of the first chunk on
 @example("plain", 0.96875, True)  # zeros within a channel of the summary
+@example("no chunks", 0.751953125, True)  # zeros from within a message's log time on
 def test_torn_at_any_byte_gives_the_frames_before_the_tear(
     tmp_path: Path, layout: str, share: float, zeros: bool
 ) -> None:
