@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from pipeprog_bringup.playback.connections import missing_connections
 from pipeprog_bringup.playback.frame_log import FrameLog
+from pipeprog_bringup.playback.interruption import repeated_signals
 from pipeprog_bringup.playback.listener import LastMessages, Listener
 from pipeprog_bringup.playback.node_processes import Graph, NodeFailure
 from pipeprog_bringup.playback.player import Player
@@ -61,8 +62,9 @@ class Session:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         try:
-            self._connect()
-            return self._pass_through()
+            with repeated_signals() as self._repeat_signals:
+                self._connect()
+                return self._pass_through()
         finally:
             self._executor.shutdown()
             self._node.destroy_node()
@@ -127,6 +129,7 @@ class Session:
     def _spin(self, seconds: float = _SPIN_SECONDS) -> None:
         """Handle what has arrived, show where the session stands, and make sure that every node works."""
         self._executor.spin_once(timeout_sec=min(max(seconds, 0.0), _SPIN_SECONDS))
+        self._repeat_signals()
         self._graph.check()
         log, listener = self.log, self._listener
         if self._stage in _MOVING:
