@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a pipe begins and ends along its axis, and which pieces are one pipe."""
+"""Where a pipe begins and ends along its axis: where points cover its surface, and where it is straight."""
 
 from __future__ import annotations
 
@@ -14,13 +14,46 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.types import Cylinder
 
+# Bins along the axis hold 12 points on average (where 12 are expected, a quarter or fewer come by chance in 0.2 %), are
+# 5 mm long at least (ends are found between bins), and at most as long as the radius, or 30 mm if that is more.
+_POINTS_PER_BIN = 12.0
+_SHORTEST_BIN, _LONGEST_BIN = 0.005, 0.03
+# Fewer points than this do not tell where a surface is.
+_LEAST_POINTS = 10
+# Sectors of 10 deg on the circumference; a bin is seen where its points are in three of them, over 30 deg.
 _SECTORS = 36
-# A bin of the barrel is seen where its points cover this angle, a bin is empty under this share of its neighbours.
-_LEAST_ARC = np.radians(30.0)
+_LEAST_SECTORS = 3
+# A bin is empty under a quarter of the lower quartile of the bins with points: the far end of a pipe has fewer points
+# than the near one, and is judged by its like.
 _LEAST_SHARE = 0.25
+_LOW_QUANTILE = 0.25
+# An end lies where the count falls to half of the level beside it: the median of 3 to 8 bins, of half the interval.
+_END_LEVEL = 0.5
+_FEWEST_END_BINS, _MOST_END_BINS = 3, 8
+# Slices in which the section's centre is solved for: 0.3 radii and 5 mm long, 16 points on average, 6 at least (two
+# make a line, four judge it), 120 at most, which bounds the time of trying all pairs of them.
+_SLICE_RADII, _SLICE_LENGTH = 0.3, 0.005
+_POINTS_PER_SLICE = 16
+_FEWEST_SLICES, _MOST_SLICES = 6, 120
+# A slice is solved for with 8 points, four for each coordinate of its centre; 4 slices judge a line.
+_LEAST_SLICE_POINTS = 8
+_LEAST_SLICES = 4
 # Deviation [m] of a pipe's axis from a line by sagging and by the waviness of clouds, over its whole length; an elbow
 # leaves the line by more within a fraction of its radius.
 _AXIS_WAVINESS = 3e-3
+# A slice agrees with a line within 2.5 standard deviations of its centre (98.8 % of Gaussian noise where one coordinate
+# is the worse, 99.8 % where both are alike), the waviness and 2 % of the radius, by which pipes are oval.
+_AGREE_SIGMAS = 2.5
+_OVAL = 0.02
+# A slice beyond the straight ones is clearly bent where it is off the line by 2.5 standard deviations and half of the
+# waviness: next to them the line is known better than over the whole length.
+_BENT_WAVINESS = 0.5
+# Slices of a tee or a clamp may disagree: three in a row at most, between stretches of more than twice as many.
+_BRIDGED = 3
+# A bend begins within the two slices beyond the last straight one.
+_BEND_SLICES = 2
+# A long-radius elbow turns about 1.5 diameters, 3 radii: at s beyond its beginning the centre is s^2 / (2 * 3 r) off.
+_ELBOW_RADII = 3.0
 
 
 @dataclass(frozen=True)
@@ -37,8 +70,8 @@ class Interval:
 
 
 def bin_length(radius: float, points_per_metre: float) -> float:
-    """Bins of 5 mm, or as long as it takes to hold a dozen points, at most the radius or 3 cm."""
-    return float(np.clip(12.0 / max(points_per_metre, 1.0), 0.005, max(radius, 0.03)))
+    """Length [m] of a bin along the axis of a pipe with this radius [m] and these points for each metre."""
+    return float(np.clip(_POINTS_PER_BIN / max(points_per_metre, 1.0), _SHORTEST_BIN, max(radius, _LONGEST_BIN)))
 
 
 def surface_intervals(points: FloatArray, cylinder: Cylinder) -> list[Interval]:
@@ -47,7 +80,7 @@ def surface_intervals(points: FloatArray, cylinder: Cylinder) -> list[Interval]:
     Positions are metres from cylinder.start along its axis. Ends lie where the occupancy falls to half of the
     interval's own level, between bins by linear interpolation.
     """
-    if len(points) < 10:
+    if len(points) < _LEAST_POINTS:
         return []
     offset = points - cylinder.start
     along = offset @ cylinder.axis
@@ -60,14 +93,12 @@ def surface_intervals(points: FloatArray, cylinder: Cylinder) -> list[Interval]:
     count = np.bincount(place, minlength=bins).astype(float)
     grid = np.zeros((bins, _SECTORS), bool)
     grid[place, sector] = True
-    # The arc is judged over three bins, since few points of a thin pipe fall in one.
+    # The sectors are counted over three bins, since a thin pipe has 12 points a bin or fewer.
     arc = grid.copy()
     arc[1:] |= grid[:-1]
     arc[:-1] |= grid[1:]
-    needed = min(int(np.ceil(_LEAST_ARC / (2 * np.pi / _SECTORS))), 3)
-    covered = arc.sum(axis=1) >= needed
-    level = np.median(count[count > 0])
-    seen = covered & (count > _LEAST_SHARE * min(level, _local_level(count)))
+    covered = arc.sum(axis=1) >= _LEAST_SECTORS
+    seen = covered & (count > _LEAST_SHARE * np.quantile(count[count > 0], _LOW_QUANTILE))
     intervals: list[Interval] = []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(int)))
     for first, last in zip(edges[::2], edges[1::2], strict=True):
@@ -76,11 +107,13 @@ def surface_intervals(points: FloatArray, cylinder: Cylinder) -> list[Interval]:
 
 
 def straight_interval(points: FloatArray, cylinder: Cylinder, sigma: float) -> Interval | None:
-    """The longest stretch of the axis on which the section's centre stays on one line: an elbow's does not.
+    """The longest stretch of the axis on which the section's centre stays on one line, as it does not in an elbow.
 
-    points (N, 3) lie near the surface, within a few `sigma` [m]. In each slice the offset of the section is solved
-    for at the given radius; of the lines through two slices the one that most slices agree with is taken (it need not
-    be the cylinder's axis, which an elbow may have tilted), and its slices from the first to the last that agree.
+    `points` (N, 3) are near the surface, with noise `sigma` [m]. In each slice across the axis the offset of the
+    section's centre is solved for at the given radius. Of the lines through two such centres the one that most slices
+    agree with is taken; it may differ from the cylinder's axis, which the points of an elbow tilt. The interval reaches
+    from the first to the last slice that agrees. Returns the extent of all points where fewer than four slices have a
+    centre, None where no line is found.
     """
     offset = points - cylinder.start
     along = offset @ cylinder.axis
@@ -89,16 +122,16 @@ def straight_interval(points: FloatArray, cylinder: Cylinder, sigma: float) -> I
     rho = np.hypot(x, y) + 1e-12
     distance = rho - cylinder.radius
     length = float(along.max() - along.min())
-    slices = int(np.clip(min(length / (0.3 * cylinder.radius + 0.005), len(points) / 16), 6, 120))
+    slices = _slice_count(length, cylinder.radius, len(points))
     low = float(along.min())
     size = length / slices
     place = np.clip(((along - low) / size).astype(int), 0, slices - 1)
     cosine, sine = x / rho, y / rho
     shift, error = _slice_shifts(cosine, sine, distance, place, slices, sigma)
     known = np.flatnonzero(np.isfinite(error))
-    if len(known) < 4:
+    if len(known) < _LEAST_SLICES:
         return Interval(low, low + length)
-    allowed = 2.5 * error + _AXIS_WAVINESS + 0.02 * cylinder.radius
+    allowed = _AGREE_SIGMAS * error + _AXIS_WAVINESS + _OVAL * cylinder.radius
     centre = np.asarray(low + (np.arange(slices) + 0.5) * size, np.float64)
     line = _best_line(centre[known], shift[known], allowed[known], max(slices // 6, 1) * size)
     if not line.any():
@@ -108,7 +141,7 @@ def straight_interval(points: FloatArray, cylinder: Cylinder, sigma: float) -> I
     longest = max(parts, key=len)
     slope, origin = _fit_line(centre[longest], shift[longest], np.asarray(1.0 / error[longest]))
     off = np.linalg.norm(shift - origin - centre[:, None] * slope, axis=1)
-    deviation: FloatArray = np.where(off > 2.5 * error + 0.5 * _AXIS_WAVINESS, off, np.nan)
+    deviation: FloatArray = np.where(off > _AGREE_SIGMAS * error + _BENT_WAVINESS * _AXIS_WAVINESS, off, np.nan)
     edges = low + longest[0] * size, low + (longest[-1] + 1) * size
     return Interval(
         _onset(edges[0], centre[: longest[0]][::-1], deviation[: longest[0]][::-1], cylinder.radius),
@@ -117,7 +150,10 @@ def straight_interval(points: FloatArray, cylinder: Cylinder, sigma: float) -> I
 
 
 def _contiguous_slices(members: IntArray, known: IntArray) -> list[IntArray]:
-    """The slices `members` parted where known slices between them disagree; a tee's few are bridged."""
+    """The slices `members`, divided where others between them disagree, unless these are at most three, as at a tee.
+
+    `known` are the slices whose centre is known.
+    """
     parts: list[IntArray] = [members[:1]]
     for last, following in pairwise(members):
         between = int(((known > last) & (known < following)).sum())
@@ -128,7 +164,7 @@ def _contiguous_slices(members: IntArray, known: IntArray) -> list[IntArray]:
     bridged = [parts[0]]
     for part in parts[1:]:
         hole = int(((known > bridged[-1][-1]) & (known < part[0])).sum())
-        if hole <= 3 and min(len(bridged[-1]), len(part)) > 2 * hole + 1:
+        if hole <= _BRIDGED and min(len(bridged[-1]), len(part)) > 2 * hole + 1:
             bridged[-1] = np.append(bridged[-1], part)
         else:
             bridged.append(part)
@@ -136,16 +172,17 @@ def _contiguous_slices(members: IntArray, known: IntArray) -> list[IntArray]:
 
 
 def _onset(end: float, centre: FloatArray, deviation: FloatArray, radius: float) -> float:
-    """Where the barrel ends before an elbow, given slices (S,) from the last straight one's edge `end` [m] outwards.
+    """Position [m] along the axis at which an elbow begins next to a straight stretch that ends at `end` [m].
 
-    A long-radius elbow turns about 1.5 diameters, so at s beyond its beginning the section is s^2 / (6 r) off the
-    line: the first clearly bent slice tells where it began. Without a bend next to it the end stands.
+    Given are the slices (S,) beyond that end, the nearest first: their centres along the axis [m] and, NaN where they
+    are not clearly bent, their deviation from the line [m]. In a long-radius elbow the section at s beyond the
+    beginning is s^2 / (6 r) off the line, so that the first bent slice tells the beginning. `end` where none is bent.
     """
-    near = slice(0, 2)
+    near = slice(0, _BEND_SLICES)
     if not np.isfinite(deviation[near]).any():
         return end
     first = int(np.flatnonzero(np.isfinite(deviation[near]))[0])
-    back = np.sqrt(6.0 * radius * deviation[first])
+    back = np.sqrt(2.0 * _ELBOW_RADII * radius * deviation[first])
     outward = 1.0 if centre[first] > end else -1.0
     onset = float(centre[first] - outward * back)
     return min(onset, end) if outward > 0 else max(onset, end)
@@ -160,7 +197,10 @@ def _fit_line(place: FloatArray, shift: FloatArray, weight: FloatArray) -> tuple
 
 @njit(cache=True, nogil=True)
 def _best_line(place: FloatArray, shift: FloatArray, allowed: FloatArray, apart: float) -> NDArray[np.bool_]:
-    """Slices that agree with the line through two of them, at least `apart`, that most agree with, and closely."""
+    """Mask (S,) of the slices that agree with the best line through two centres at least `apart` [m] from each other.
+
+    Every agreeing slice adds 1 to a line's worth, less half of its deviation as a share of what is `allowed` (S,) [m].
+    """
     count = len(place)
     best = 0.0
     members = np.zeros(count, np.bool_)
@@ -188,36 +228,43 @@ def _best_line(place: FloatArray, shift: FloatArray, allowed: FloatArray, apart:
 def _slice_shifts(
     cosine: FloatArray, sine: FloatArray, distance: FloatArray, place: FloatArray, slices: int, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Offset (S, 2) [m] of each slice's section and its standard deviation (S,), NaN where too few points are."""
+    """Offset (S, 2) [m] of each slice's centre from the axis and its standard deviation (S,) [m].
+
+    The latter is NaN where a slice has fewer than 8 points, or they determine the centre no better than one of them
+    would. Given are, for each point, cosine and sine of its angle around the axis, its distance from the surface [m]
+    and its slice.
+    """
 
     def total(values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(place, weights=values, minlength=slices), np.float64)
 
     count = np.bincount(place, minlength=slices)
     cc, cs, ss = total(cosine * cosine), total(cosine * sine), total(sine * sine)
-    # A prior of a radius-sized shift would be arbitrary; one sigma on one point only keeps empty slices solvable.
+    # One measurement of zero for each coordinate, with the noise of a point, keeps slices without points solvable.
     cc, ss = cc + 1.0, ss + 1.0
     cd, sd = total(cosine * distance), total(sine * distance)
     determinant = cc * ss - cs**2
     shift = np.stack([(ss * cd - cs * sd) / determinant, (cc * sd - cs * cd) / determinant], axis=1)
     error = sigma * np.sqrt((cc + ss) / determinant)
-    return shift, np.where((count >= 8) & (error < sigma), error, np.nan)
+    return shift, np.where((count >= _LEAST_SLICE_POINTS) & (error < sigma), error, np.nan)
 
 
-def _local_level(count: FloatArray) -> float:
-    return float(np.quantile(count[count > 0], 0.25))
+def _slice_count(length: float, radius: float, points: int) -> int:
+    """Number of slices of a barrel of this length [m] and radius [m] with this number of points."""
+    fine = length / (_SLICE_RADII * radius + _SLICE_LENGTH)
+    return int(np.clip(min(fine, points / _POINTS_PER_SLICE), _FEWEST_SLICES, _MOST_SLICES))
 
 
 def _ends(count: FloatArray, first: int, last: int, low: float, size: float) -> tuple[float, float]:
     """Ends [m] of the interval of bins first..last-1: where the counts cross half of the level beside each end."""
-    near = max(3, min(8, (last - first) // 2))
+    near = max(_FEWEST_END_BINS, min(_MOST_END_BINS, (last - first) // 2))
     left = np.median(count[first : first + near])
     right = np.median(count[max(last - near, first) : last])
     start = first
-    while start < last - 1 and count[start] < 0.5 * left:
+    while start < last - 1 and count[start] < _END_LEVEL * left:
         start += 1
     end = last - 1
-    while end > start and count[end] < 0.5 * right:
+    while end > start and count[end] < _END_LEVEL * right:
         end -= 1
     # The outermost full bin may be filled in part, and spill over into the bin outside it.
     lead = min(count[start] / max(left, 1e-9), 1.0) + (min(count[start - 1] / max(left, 1e-9), 0.5) if start else 0.0)

@@ -12,12 +12,30 @@ from scipy.sparse.csgraph import connected_components
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
 
-# Pieces of one pipe: axes within 2 deg, offset by a quarter of the radius and 4 mm of waviness, radii within 12 %: half
-# the step of 25 % between standard sizes.
+# Pieces of one pipe: axes within 2 deg, or half a radius over the length of the shorter piece, as well as its direction
+# is known; offset by a quarter of the radius and 4 mm of waviness; radii within 12 %: half the step of 25 % between
+# standard sizes.
 _ANGLE = np.radians(2.0)
+_ANGLE_RADII = 0.5
 _OFFSET = 0.25
 _RATIO = 1.12
 _LEAST_OFFSET = 4e-3
+# Gap between pieces of one pipe: ten radii or 0.3 m are what fittings, clamps and occluders hide. Where the offset is
+# within half of what is allowed, it may be as long as the shorter piece, or 15 radii.
+_GAP_RADII, _GAP = 10.0, 0.3
+_CLOSE = 0.5
+_CLOSE_GAP_RADII = 15.0
+# The middle of an elbow: at most 6 radii long (the arc of a long-radius elbow, 3 radii times 90 deg, is 4.7), beside a
+# pipe at least 1.5 times as long, whose radius is the same to a factor of 1.25, the step between standard sizes.
+_ELBOW_RADII = 6.0
+_LONGER = 1.5
+_THINNER, _THICKER = 0.8, 1.25
+# It is at 8 to 75 deg to that pipe (the chord of a bend of 90 deg is at 45 deg; below 8 deg it is the same pipe), and
+# their ends are at most 2.5 of its radii apart, since what lies between is bent and belongs to neither.
+_ELBOW_LEAST, _ELBOW_MOST = np.radians(8.0), np.radians(75.0)
+_TOUCH = 2.5
+# Places on an axis at which its distance from another is taken: every eighth of it.
+_PLACES = 9
 
 
 def near(one: Cylinder, other: Cylinder, reach: float) -> bool:
@@ -56,14 +74,14 @@ def elbows(cylinders: Sequence[Cylinder]) -> set[int]:
     """Which cylinders are the middle of an elbow: short, beside an end of a longer one as thick, at an angle to it."""
     found = set()
     for i, one in enumerate(cylinders):
-        if one.length > 6.0 * one.radius:
+        if one.length > _ELBOW_RADII * one.radius:
             continue
         for other in cylinders:
-            if other.length < 1.5 * one.length or not 0.8 < one.radius / other.radius < 1.25:
+            if other.length < _LONGER * one.length or not _THINNER < one.radius / other.radius < _THICKER:
                 continue
             cosine = abs(float(one.axis @ other.axis))
             touch = min(float(np.linalg.norm(a - b)) for a in (one.start, one.end) for b in (other.start, other.end))
-            if np.cos(np.radians(75.0)) < cosine < np.cos(np.radians(8.0)) and touch < 2.5 * one.radius:
+            if np.cos(_ELBOW_MOST) < cosine < np.cos(_ELBOW_LEAST) and touch < _TOUCH * one.radius:
                 found.add(i)
     return found
 
@@ -73,7 +91,7 @@ def _one_pipe(one: Cylinder, other: Cylinder) -> bool:
         return False
     shorter, longer = sorted((one, other), key=lambda cylinder: cylinder.length)
     radius = longer.radius
-    if abs(float(shorter.axis @ longer.axis)) < np.cos(max(_ANGLE, 0.5 * radius / shorter.length)):
+    if abs(float(shorter.axis @ longer.axis)) < np.cos(max(_ANGLE, _ANGLE_RADII * radius / shorter.length)):
         return False
     along = np.array([(end - longer.start) @ longer.axis for end in (shorter.start, shorter.end)])
     gap = max(float(along.min()) - longer.length, -float(along.max()))
@@ -82,13 +100,14 @@ def _one_pipe(one: Cylinder, other: Cylinder) -> bool:
     offset = float(np.linalg.norm(aside - (aside @ longer.axis) * longer.axis))
     if offset > _OFFSET * radius + _LEAST_OFFSET:
         return False
-    close = offset < 0.5 * _OFFSET * radius + _LEAST_OFFSET
-    return gap < max(10.0 * radius, 0.3, max(shorter.length, 15.0 * radius) if close else 0.0)
+    close = offset < _CLOSE * _OFFSET * radius + _LEAST_OFFSET
+    allowed = max(_GAP_RADII * radius, _GAP)
+    return gap < (max(allowed, shorter.length, _CLOSE_GAP_RADII * radius) if close else allowed)
 
 
-def _axis_distance(one: Cylinder, other: Cylinder, steps: int = 9) -> float:
+def _axis_distance(one: Cylinder, other: Cylinder) -> float:
     """Least distance [m] of points along one axis from the other's segment."""
-    share = np.linspace(0.0, 1.0, steps)[:, None]
+    share = np.linspace(0.0, 1.0, _PLACES)[:, None]
     best = np.inf
     for a, b in ((one, other), (other, one)):
         points: FloatArray = a.start + share * (a.end - a.start)

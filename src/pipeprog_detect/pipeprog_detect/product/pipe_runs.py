@@ -13,14 +13,21 @@ from scipy.sparse.csgraph import connected_components
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder, Pipe
 
-# Axes that a fitting joins meet within this share of the radius, and what their measurement may be off by [m].
+# Axes that a fitting joins meet within 0.3 radii, and 5 mm by which their measurement may be off; over the gap of a
+# coupling also 3 % of its length, as directions of short pipes are off by up to 1.7 deg.
 _MISS, _LEAST_MISS = 0.3, 5e-3
-# A turn [rad] below the first is a coupling's, not an elbow's; no fitting turns by more than the second.
+_MISS_SLOPE = 0.03
+# A turn [rad] below 8 deg is a coupling's, not an elbow's; no fitting turns by more than 135 deg. A branch leaves its
+# run at 45 deg or more; 30 deg leaves room for what its axis may be off by.
 _STRAIGHT, _SHARPEST = np.radians(8.0), np.radians(135.0)
-# Bends turn about up to five diameters; their sockets add up to a diameter. Radii of one size agree within a quarter.
+_LEAST_BRANCHING = np.radians(30.0)
+# Bends turn about up to five diameters (10 radii); their sockets add up to a diameter (2 radii). Radii of one size
+# agree within 25 %, the step between standard sizes.
 _WIDEST_BEND, _SOCKET = 10.0, 2.0
 _SAME_SIZE = 1.25
-# What a reducer or a coupling is long at most, in radii of the thicker pipe, and at least [m].
+# Ends measured too long overlap: in a coupling by a radius at most, in an elbow up to half a radius beyond the corner.
+_OVERLAP, _CORNER_OVERLAP = 1.0, 0.5
+# A reducer or a coupling hides at most 10 radii of the thicker pipe, or 0.3 m.
 _COUPLING, _LEAST_COUPLING = 10.0, 0.3
 
 
@@ -111,8 +118,8 @@ def _between_ends(first: Pipe, second: Pipe, a: int, b: int) -> tuple[float, Joi
         gap = to - from_
         along = float(gap @ out)
         miss = float(np.linalg.norm(gap - along * out))
-        # Over the gap the directions may be off by what the shorter one's ends are.
-        if not -thick < along < max(_COUPLING * thick, _LEAST_COUPLING) or miss > allowed + 0.03 * abs(along):
+        longest = max(_COUPLING * thick, _LEAST_COUPLING)
+        if not -_OVERLAP * thick < along < longest or miss > allowed + _MISS_SLOPE * abs(along):
             return None
         kind = "coupling" if thick < _SAME_SIZE * thin else "reducer"
         return miss, Joint(kind, ids, turn, max(along, 0.0))
@@ -120,7 +127,12 @@ def _between_ends(first: Pipe, second: Pipe, a: int, b: int) -> tuple[float, Joi
         return None
     s, t, miss = _meeting(from_, out, to, back)
     longest = _WIDEST_BEND * thick * np.tan(0.5 * turn) + _SOCKET * thick
-    if miss > allowed or min(s, t) < -0.5 * thick or max(s, t) > longest or abs(s - t) > 2.0 * _SOCKET * thick:
+    if (
+        miss > allowed
+        or min(s, t) < -_CORNER_OVERLAP * thick
+        or max(s, t) > longest
+        or abs(s - t) > 2.0 * _SOCKET * thick
+    ):
         return None
     # The bend begins where the nearer end is; what the other has more is straight socket.
     tangent = max(min(s, t), 0.0)
@@ -132,7 +144,7 @@ def _branch(first: Pipe, second: Pipe, a: int) -> tuple[float, Joint] | None:
     branch, run = first.cylinder, second.cylinder
     end, out = _end(branch, a)
     turn = float(np.arccos(np.clip(abs(out @ run.axis), 0.0, 1.0)))
-    if turn < np.radians(30.0) or branch.radius > _SAME_SIZE * run.radius:
+    if turn < _LEAST_BRANCHING or branch.radius > _SAME_SIZE * run.radius:
         return None
     s, t, miss = _meeting(end, out, run.start, run.axis)
     reach = run.radius / float(np.sin(turn)) + _SOCKET * run.radius
@@ -142,7 +154,10 @@ def _branch(first: Pipe, second: Pipe, a: int) -> tuple[float, Joint] | None:
 
 
 def _meeting(one: FloatArray, out: FloatArray, other: FloatArray, back: FloatArray) -> tuple[float, float, float]:
-    """Distances along two lines to where they come nearest, and how near that is."""
+    """Distances along two lines to where they come nearest [m], and how far apart they are there [m].
+
+    The lines run through `one` and `other` (3,) along the unit directions `out` and `back` (3,), which must differ.
+    """
     gap, cosine = other - one, float(out @ back)
     sine = 1.0 - cosine**2
     s = float(gap @ out - cosine * (gap @ back)) / sine
