@@ -9,7 +9,13 @@ import pytest
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.cloud import octree
-from pipeprog_detect.cloud.cutting_planes import CuttingPlane, parse_planes, place_planes, section_hypotheses
+from pipeprog_detect.cloud.cutting_planes import (
+    CuttingPlane,
+    direction_families,
+    parse_planes,
+    place_planes,
+    section_hypotheses,
+)
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
@@ -80,6 +86,41 @@ def test_planes_are_placed_across_the_pipes() -> None:
             and ((pipe.start - plane.point) @ plane.normal) * ((pipe.end - plane.point) @ plane.normal) < 0.0
         ]
         assert cuts
+
+
+def test_two_directions_among_stray_ones_make_two_families_of_planes() -> None:
+    pipes = [leaning(0.0, 0.0365, 0.0), leaning(0.9, 0.0365, 90.0)]
+    rng = np.random.default_rng(4)
+    stray = rng.uniform([-0.5, -0.5, 0.0], [1.4, 0.5, 1.0], (4000, 3))
+    points = np.concatenate([*(half_pipe(pipe, seed=k) for k, pipe in enumerate(pipes)), stray])
+    normals = []
+    for order in (np.arange(len(points)), rng.permutation(len(points))):
+        planes = place_planes(octree.build(points[order]), NOISE, (0.005, 0.09))
+        normals.append(np.array([plane.normal for plane in planes]))
+        for pipe in pipes:
+            assert any(abs(plane.normal @ pipe.axis) > 0.999 for plane in planes)
+        for plane in planes:
+            assert max(abs(plane.normal @ pipe.axis) for pipe in pipes) > 0.999
+    np.testing.assert_allclose(np.abs(np.einsum("ij,ij->i", *normals)), 1.0, atol=1e-9)
+
+
+def test_families_are_the_dense_directions_whatever_their_sign_and_order() -> None:
+    rng = np.random.default_rng(5)
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+    directions = np.concatenate(
+        [axis + np.radians(3.0) * rng.normal(size=(n, 3)) for axis, n in zip(axes, (300, 200), strict=True)]
+        + [rng.normal(size=(200, 3))]
+    )
+    directions *= rng.choice([-1.0, 1.0], (len(directions), 1)) / np.linalg.norm(directions, axis=1)[:, None]
+    families = direction_families(directions)
+    assert len(families) == 2
+    for family, axis, count in zip(families, axes, (300, 200), strict=True):
+        mean = np.linalg.eigh(directions[family].T @ directions[family])[1][:, 2]
+        assert np.degrees(np.arccos(np.abs(mean @ axis))) < 1.0
+        assert 0.98 * count < len(family) < 1.1 * count
+    order = rng.permutation(len(directions))
+    again = direction_families(directions[order])
+    assert [set(order[family]) for family in again] == [set(family) for family in families]
 
 
 @pytest.mark.parametrize("straighten", [False, True])
