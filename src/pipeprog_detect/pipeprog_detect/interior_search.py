@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pipes seen from inside: a camera in a sewer sees a concave cylinder around it, among stray points.
 
-Near and half-dark, such clouds are too torn for curvature and for following a pipe along its axis: two normals that
-meet give an axis and a radius at once, a search around them the cylinder that most of the circumference agrees with.
+Such clouds have gaps and strong noise, so that local curvature and growth along the axis, by which pipes are found from
+outside, fail. Here each pair of surface normals that intersect proposes an axis and a radius; random search around the
+best proposals maximises the part of the circumference that agrees with the cylinder.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,30 +23,80 @@ from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.scene_context import SceneContext
 
-# Of all pairs of sites a hundredth lie on one pipe even where nine tenths of the sites are stray: 400 good ones remain.
+# Sites at which the surface is estimated need 50 points in the cloud, and 10 good sites make a search. Their patches
+# are half of the least radius wide, on which that pipe is flat to h^2 / (8 r), a thirty-second of its radius, but 20 mm
+# at least, which averages the noise, and 80 mm at most; sites stand a quarter of it apart, so that patches overlap.
+_LEAST_POINTS, _LEAST_SITES = 50, 10
+_PATCH_RADII, _LEAST_PATCH, _MOST_PATCH = 0.5, 0.02, 0.08
+_SITES_PER_PATCH = 0.25
+# A patch tells a normal where it is less than 0.4 times as thick as it is wide, as standard deviations.
+_FLAT = 0.4
+# Of all pairs of sites a hundredth lie on one pipe even where nine tenths of the sites are stray: of 40000 pairs 400.
+# Not more than 4000 sites are searched, which bounds the time.
 _PAIRS = 40_000
 _MOST_SITES = 4_000
-# The 48 best hypotheses are sharpened by 400 random steps each, which shrink from a tenth of the radius to a hundredth;
-# the 12 best of them are measured.
-_STARTS, _STEPS = 48, 400
-_FIRST_STEP, _LAST_STEP = 0.1, 0.01
-_BEST = 12
-# Part of the circumference on which agreeing sites count together.
-_SECTORS = 36
-# Half of a stretch that is sharpened on, in radii: normals tell the axis over a diameter or two.
-_REACH = 2.0
-# Halves of the stretches on which a pipe that was found is followed, in radii.
-_STRETCHES = (3.0, 4.5, 6.5, 10.0)
-_MOST_TURNS = 8
-# Hypotheses whose radii, and whose axes where they lie, differ by less than this share of the radius are one.
-_ALIKE = 0.1
-# Normals at less than 25 deg to each other do not tell where they meet; those of one circle meet at equal distances.
+# Normals at less than 25 deg to each other do not tell where they meet. Those of one circle meet at equal distances, to
+# 15 % of their mean, and their sites lie within two diameters of the thickest pipe.
 _LEAST_ANGLE = float(np.sin(np.radians(25.0)))
 _UNEQUAL = 0.15
-# Most points within the pipe or behind its wall, in points on the wall: from inside neither is seen.
-_INTRUSION_MAX = 0.15
-# Depth cameras are several times as rough at the far end of a pipe as at the near one.
+_FARTHEST_PAIR = 4.0
+# Sites agree with a cylinder within 3 sigma (99.7 % of Gaussian noise) and 3 % of the radius, which a start is off by,
+# where their normal is within 32 deg of the direction to the axis: the patches' normals are that rough in torn clouds.
+_SIGMAS, _SHARE = 3.0, 0.03
+_LEAST_COSINE = 0.85
+# Sectors of 10 deg of the circumference, in each of which the agreeing sites count together.
+_SECTORS = 36
+# Half of the stretch of a pipe on which sites are counted, in radii: normals tell the axis over a diameter or two.
+_REACH = 2.0
+# Every second site is counted for the first judgement of all hypotheses; those of less than a fifth of the best one's
+# value are left out.
+_THINNED = 2
+_LEAST_VALUE = 0.2
+# The 48 best hypotheses are refined by 400 random steps each, which shrink from a tenth of the radius to a hundredth,
+# as the tolerance does from the start's to the noise's; every 40 steps the value is taken again, since the tolerance
+# has changed by a tenth of its way. The 12 best of them are measured.
+_STARTS, _STEPS = 48, 400
+_FIRST_STEP, _LAST_STEP = 0.1, 0.01
+_SAME_TOLERANCE = 40
+_BEST = 12
+# A pipe is moved to where it is seen best over three times its own length either way.
+_SHIFT_LENGTHS = 3.0
+# Hypotheses whose radii, and whose axes where they lie, differ by less than a tenth of the radius, and whose directions
+# differ by less than 10 deg, are one: the refinement moves them by as much.
+_ALIKE = 0.1
+_ALIKE_COSINE = float(np.cos(np.radians(10.0)))
+# Points within 1.5 radii of the axis are fitted: the start is off by a tenth of the radius, the wall's far scatter by
+# more. The fit is repeated, 8 times at most, until the radius changes by less than half of its standard deviation.
+_FITTED_RADII = 1.5
+_MOST_TURNS = 8
+_SETTLED = 0.5
+# Scatter of points about the surface [m]: the noise, 1.2 times as large as estimated on patches that follow it, and 0.5
+# mm of waviness. Depth cameras are twice as rough at the far end of a pipe as on average.
+_UNDERESTIMATED, _WAVINESS = 1.2, 5e-4
 _ROUGHNESS = 2.0
+# Halves of the stretches on which a pipe that was found is followed, in radii. A longer one is taken where the radius
+# stays within 2 standard deviations, and at least half of what was added is seen.
+_STRETCHES = (3.0, 4.5, 6.5, 10.0)
+_SAME_RADIUS = 2.0
+_LEAST_ADDED = 0.5
+# Most points behind the wall of a pipe, as a share of the points on it: from inside none is seen, stray ones are some.
+# Points within 3 bands of the surface are on the wall, from 4 bands on behind it; they are compared in cells of 10 deg
+# and half a radius along the axis.
+_INTRUSION_MAX = 0.15
+_WALL_BANDS, _BEHIND_BANDS = 3.0, 4.0
+_CELLS_PER_RADIUS = 2.0
+# A pipe that was found goes on as far as the camera sees, too rough there to be measured: points up to 10 radii or 1 m
+# beyond its ends, within 1.3 radii and 6 bands of its axis, are taken out of the search.
+_TAKEN_RADII, _TAKEN_LENGTH = 10.0, 1.0
+_TAKEN_REACH, _TAKEN_BANDS = 1.3, 6.0
+
+
+class _Sites(NamedTuple):
+    """Sites on surfaces: points (S, 3) [m], unit normals (S, 3) of either sign, and weights (S,)."""
+
+    points: FloatArray
+    normals: FloatArray
+    weight: FloatArray
 
 
 def find_concave(
@@ -53,10 +106,10 @@ def find_concave(
     radius_range: tuple[float, float],
     seed: int,
 ) -> list[Candidate]:
-    """Cylinders of the tree's points that are seen from inside, the best supported first.
+    """Candidates for pipes that are seen from inside among the tree's points, the one with most points first.
 
-    Where the normals `around` are known they must point to the axis. The search takes random pairs of sites and random
-    steps, both by `seed`.
+    Where `around` knows the normals of the surface, they must point to the axis. Radii are sought in
+    `radius_range` [m]. Pairs of sites and steps are drawn at random by `seed`.
     """
     free = np.ones(len(tree.points), bool)
     found: list[Candidate] = []
@@ -70,29 +123,28 @@ def find_concave(
         best = _grown(rest, max(good, key=lambda candidate: candidate.points), criteria)
         found.append(best)
         cylinder = best.cylinder
-        # The pipe goes on as far as the camera sees, too rough there to be measured.
-        margin = max(10.0 * cylinder.radius, 1.0) * cylinder.axis
-        reach = 1.3 * cylinder.radius + 6.0 * best.band
+        margin = max(_TAKEN_RADII * cylinder.radius, _TAKEN_LENGTH) * cylinder.axis
+        reach = _TAKEN_REACH * cylinder.radius + _TAKEN_BANDS * best.band
         free[tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)] = False
 
 
 def _measured(tree: Octree, start: Cylinder, stretch: float, criteria: AcceptanceCriteria) -> Candidate | None:
-    """The pipe that a nearly right cylinder is, as far as `stretch` radii either side; None where it is none."""
+    """The candidate fitted around `start`, `stretch` radii to either side; None where it is not accepted."""
     middle = start.middle
     cylinder = start
-    most = wide = _ROUGHNESS * (1.2 * criteria.noise + 5e-4)
-    # The band decides which points are fitted, and the fit what the band holds.
+    most = wide = _ROUGHNESS * (_UNDERESTIMATED * criteria.noise + _WAVINESS)
+    # The band selects the points of the fit, and the residuals of the fit give the band.
     for _ in range(_MOST_TURNS):
         half = stretch * cylinder.radius * cylinder.axis
         cylinder = Cylinder(middle - half, middle + half, cylinder.radius)
-        points = tree.points[tree.near_segment(cylinder.start, cylinder.end, 1.5 * cylinder.radius)]
+        points = tree.points[tree.near_segment(cylinder.start, cylinder.end, _FITTED_RADII * cylinder.radius)]
         settled = refit(points, cylinder, wide, whole=True)
         if settled is None:
             return None
         candidate = settled
         change = abs(candidate.cylinder.radius - cylinder.radius)
         cylinder, wide = candidate.cylinder, min(candidate.band, most)
-        if change < 0.5 * candidate.radius_sigma:
+        if change < _SETTLED * candidate.radius_sigma:
             break
     if not criteria.accept(candidate) or _beyond(points, candidate) > _INTRUSION_MAX * candidate.points:
         return None
@@ -100,75 +152,84 @@ def _measured(tree: Octree, start: Cylinder, stretch: float, criteria: Acceptanc
 
 
 def _grown(tree: Octree, pipe: Candidate, criteria: AcceptanceCriteria) -> Candidate:
-    """The pipe as far as its surface can be followed: farther on it is rougher, what draws the radius is left out."""
+    """The pipe on the longest of the stretches along which its radius stays the same and its surface is seen."""
     for stretch in _STRETCHES:
         more = _measured(tree, pipe.cylinder, stretch, criteria)
-        if more is None or abs(more.cylinder.radius - pipe.cylinder.radius) > 2.0 * pipe.radius_sigma:
+        if more is None or abs(more.cylinder.radius - pipe.cylinder.radius) > _SAME_RADIUS * pipe.radius_sigma:
             break
-        # The far end closes the circle once more, a gap away.
-        if _seen(more) - _seen(pipe) < 0.5 * (more.cylinder.length - pipe.cylinder.length):
+        # Across a gap the far end may show the whole circle again; it is not joined.
+        if _seen(more) - _seen(pipe) < _LEAST_ADDED * (more.cylinder.length - pipe.cylinder.length):
             break
         pipe = more
     return pipe
 
 
 def _seen(candidate: Candidate) -> float:
+    """Length [m] of the barrel on which points cover it."""
     return candidate.evidence.coverage * candidate.cylinder.length
 
 
 def _beyond(points: FloatArray, candidate: Candidate) -> int:
-    """How many points lie behind the wall where it is seen: what a wall hides is not seen from inside.
+    """Number of points (of N, 3) behind the wall where the wall is seen; from inside, a wall hides them.
 
-    In each cell of the surface no more of them count than the wall has there.
+    In each cell of the surface at most as many count as the wall has there.
     """
     cylinder = candidate.cylinder
     u, v = basis(cylinder.axis)
     offset = points - cylinder.start
     along, x, y = offset @ cylinder.axis, offset @ u, offset @ v
-    slices = int(np.ceil(2.0 * cylinder.length / cylinder.radius))
+    slices = int(np.ceil(_CELLS_PER_RADIUS * cylinder.length / cylinder.radius))
     here = (along > 0) & (along < cylinder.length)
     distance = np.hypot(x, y) - cylinder.radius
     sector = ((np.arctan2(y, x) + np.pi) * (_SECTORS / (2 * np.pi))).astype(int) % _SECTORS
     cell = sector + _SECTORS * np.floor(along / cylinder.length * slices).astype(int)
-    wall = np.bincount(cell[here & (np.abs(distance) < 3.0 * candidate.band)], minlength=_SECTORS * slices)
-    behind = np.bincount(cell[here & (distance > 4.0 * candidate.band)], minlength=_SECTORS * slices)
+    wall = np.bincount(cell[here & (np.abs(distance) < _WALL_BANDS * candidate.band)], minlength=_SECTORS * slices)
+    behind = np.bincount(cell[here & (distance > _BEHIND_BANDS * candidate.band)], minlength=_SECTORS * slices)
     return int(np.minimum(wall, behind).sum())
 
 
-def _starts(tree: Octree, sigma: float, radius_range: tuple[float, float], seed: int) -> list[Cylinder]:
-    """Cylinders through two sites each that most of their circumference agrees with, sharpened, the best first."""
-    if len(tree.points) < 50:
-        return []
-    # Patches on which the thinnest pipe looked for is still flat to a few sigma, and that hold its noise down.
-    scale = float(np.clip(0.5 * radius_range[0], 0.02, 0.08))
-    sites = tree.thinned(tree.level_of(0.25 * scale))
-    shape = local_shape.surfaces(tree, sites, scale, sigma)
-    good = np.flatnonzero((shape.count > 0) & (shape.spread[:, 0] < 0.4 * shape.spread[:, 1]))
+def _sites(tree: Octree, sigma: float, least_radius: float) -> _Sites | None:
+    """Sites where the cloud is a surface, at most 4000; None where there are too few.
+
+    The weight of a site is the number of points in its patch: near the camera clouds are dense and precise. Weights
+    capped at the 1024 points that a normal is fitted to are no better: with seeds 0 and 1 they name 16 and 17 of 34
+    real sewer clouds, those here 18 and 18.
+    """
+    if len(tree.points) < _LEAST_POINTS:
+        return None
+    scale = float(np.clip(_PATCH_RADII * least_radius, _LEAST_PATCH, _MOST_PATCH))
+    shape = local_shape.surfaces(tree, tree.thinned(tree.level_of(_SITES_PER_PATCH * scale)), scale, sigma)
+    good = np.flatnonzero((shape.count > 0) & (shape.spread[:, 0] < _FLAT * shape.spread[:, 1]))
     good = good[:: -(-len(good) // _MOST_SITES)] if len(good) else good
-    if len(good) < 10:
+    if len(good) < _LEAST_SITES:
+        return None
+    return _Sites(shape.feet[good], shape.normals[good], shape.count[good].astype(float))
+
+
+def _starts(tree: Octree, sigma: float, radius_range: tuple[float, float], seed: int) -> list[Cylinder]:
+    """Different cylinders through two sites each, refined, the one that most of its circumference agrees with first."""
+    sites = _sites(tree, sigma, radius_range[0])
+    if sites is None:
         return []
-    points, across = shape.feet[good], shape.normals[good]
-    # Near the camera the cloud is dense and fine, far from it neither: what is dense tells more.
-    weight = shape.count[good].astype(float)
     rng = np.random.default_rng(seed)
-    share = np.cumsum(weight) / weight.sum()
-    pairs = np.minimum(np.searchsorted(share, rng.random((_PAIRS, 2))), len(good) - 1)
-    centres, axes, radii = _through_pairs(points, across, pairs, radius_range)
+    share = np.cumsum(sites.weight) / sites.weight.sum()
+    pairs = np.minimum(np.searchsorted(share, rng.random((_PAIRS, 2))), len(share) - 1)
+    centres, axes, radii = _through_pairs(sites, pairs, radius_range)
     if not len(radii):
         return []
-    some = slice(None, None, 2)
-    worth = _worths(points[some], across[some], weight[some], centres, axes, radii, 3.0 * sigma)
+    some = _Sites(*(each[::_THINNED] for each in sites))
+    agreement = _agreements(some, centres, axes, radii, _SIGMAS * sigma)
     found: list[tuple[float, Cylinder]] = []
-    waiting = worth > 0.2 * worth.max()
-    for number in np.argsort(-worth, kind="stable"):
+    waiting = agreement > _LEAST_VALUE * agreement.max()
+    for number in np.argsort(-agreement, kind="stable"):
         if len(found) == _STARTS or not waiting[number]:
             continue
         waiting &= ~_alike(centres, axes, radii, int(number))
         steps = rng.normal(size=(_STEPS, 7))
-        value, centre, axis, radius = _sharpened(
-            points, across, weight, centres[number], axes[number], radii[number], sigma, steps, *radius_range
+        value, centre, axis, radius = _refined(
+            sites, centres[number], axes[number], radii[number], sigma, steps, radius_range
         )
-        found.append((value, _densest(points, weight, Cylinder(centre, centre + 2.0 * radius * axis, radius), sigma)))
+        found.append((value, _seen_best(sites, Cylinder(centre, centre + _REACH * radius * axis, radius), sigma)))
     found.sort(key=lambda each: -each[0])
     different: list[Cylinder] = []
     for _, cylinder in found:
@@ -178,30 +239,31 @@ def _starts(tree: Octree, sigma: float, radius_range: tuple[float, float], seed:
 
 
 def _same(one: Cylinder, other: Cylinder) -> bool:
-    """Whether two cylinders are one within what measuring them mends."""
+    """Whether two cylinders are one within what measuring them corrects."""
     centres = np.stack([each.middle for each in (other, one)])
     axes, radii = np.stack([other.axis, one.axis]), np.array([other.radius, one.radius])
     return bool(_alike(centres, axes, radii, 0)[1])
 
 
 def _alike(centres: FloatArray, axes: FloatArray, radii: FloatArray, number: int) -> NDArray[np.bool_]:
-    """Which cylinders (H,) are the one with this number within what the refinement mends."""
+    """Which cylinders (H,) are the one with this number within what the refinement corrects."""
     offset = centres - centres[number]
     lateral = np.linalg.norm(offset - (offset @ axes[number])[:, None] * axes[number], axis=1)
     allowed = _ALIKE * radii[number]
-    same = np.abs(axes @ axes[number]) > np.cos(np.radians(10.0))
+    same = np.abs(axes @ axes[number]) > _ALIKE_COSINE
     return np.asarray(same & (lateral < allowed) & (np.abs(radii - radii[number]) < allowed))
 
 
 def _through_pairs(
-    points: FloatArray, across: FloatArray, pairs: NDArray[np.int64], radius_range: tuple[float, float]
+    sites: _Sites, pairs: NDArray[np.int64], radius_range: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points on the axes (H, 3), directions (H, 3) and radii (H,) of the cylinders that two normals each make."""
+    """Points on the axes (H, 3), directions (H, 3) and radii (H,) of the cylinders that pairs (P, 2) make."""
+    points, across = sites.points, sites.normals
     one, other = pairs[:, 0], pairs[:, 1]
     axis = np.cross(across[one], across[other])
     sine = np.linalg.norm(axis, axis=1)
     gap = points[other] - points[one]
-    near = (sine > _LEAST_ANGLE) & (np.linalg.norm(gap, axis=1) < 4.0 * radius_range[1])
+    near = (sine > _LEAST_ANGLE) & (np.linalg.norm(gap, axis=1) < _FARTHEST_PAIR * radius_range[1])
     one, other, gap = one[near], other[near], gap[near]
     axis = axis[near] / sine[near][:, None]
     gap -= np.einsum("ij,ij->i", gap, axis)[:, None] * axis
@@ -217,35 +279,30 @@ def _through_pairs(
     return centre[good], axis[good], radius[good]
 
 
-def _densest(points: FloatArray, weight: FloatArray, cylinder: Cylinder, sigma: float) -> Cylinder:
-    """The cylinder moved along its axis to where its surface, over its own length, has most points: seen best there."""
-    along, distance = cylinder.along(points), cylinder.surface_distance(points)
-    near = (np.abs(distance) < 3.0 * sigma + 0.03 * cylinder.radius) & (np.abs(along) < 3.0 * cylinder.length)
+def _seen_best(sites: _Sites, cylinder: Cylinder, sigma: float) -> Cylinder:
+    """The cylinder moved along its axis to where the sites on its surface, over its own length, have most weight."""
+    along, distance = cylinder.along(sites.points), cylinder.surface_distance(sites.points)
+    near = np.abs(distance) < _SIGMAS * sigma + _SHARE * cylinder.radius
+    near &= np.abs(along) < _SHIFT_LENGTHS * cylinder.length
     if not near.any():
         return cylinder
     order = np.flatnonzero(near)[np.argsort(along[near], kind="stable")]
-    place, total = along[order], np.append(0.0, np.cumsum(weight[order]))
+    place, total = along[order], np.append(0.0, np.cumsum(sites.weight[order]))
     within = total[np.searchsorted(place, place + cylinder.length)] - total[:-1]
     start = cylinder.start + place[int(np.argmax(within))] * cylinder.axis
     return Cylinder(start, start + cylinder.length * cylinder.axis, cylinder.radius)
 
 
 @njit(cache=True)
-def _worth(
-    points: FloatArray,
-    across: FloatArray,
-    weight: FloatArray,
-    centre: FloatArray,
-    axis: FloatArray,
-    radius: float,
-    tolerance: float,
-) -> float:
-    """How far the sites agree with a cylinder by distance (MSAC) and normal, summed over its circumference.
+def _agreement(sites: _Sites, centre: FloatArray, axis: FloatArray, radius: float, tolerance: float) -> float:
+    """How well sites agree with a cylinder by distance, up to `tolerance` [m], and normal, over its circumference.
 
-    Of each sector the square root of its weight counts: an arc tells the radius, a dense patch does not.
+    A site adds its weight times 1 - (distance / tolerance)^2 (MSAC) to its sector. The square roots of the sectors'
+    sums are added up, so that an arc, which tells the radius, counts for more than a dense patch.
     """
     u, v = basis(axis)
     sectors = np.zeros(_SECTORS)
+    points, normals = sites.points, sites.normals
     for i in range(len(points)):
         ox, oy, oz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         z = ox * axis[0] + oy * axis[1] + oz * axis[2]
@@ -257,62 +314,55 @@ def _worth(
         miss = (rho - radius) / tolerance
         if abs(miss) >= 1.0:
             continue
-        nx = across[i, 0] * u[0] + across[i, 1] * u[1] + across[i, 2] * u[2]
-        ny = across[i, 0] * v[0] + across[i, 1] * v[1] + across[i, 2] * v[2]
-        if abs(x * nx + y * ny) > 0.85 * rho:
+        nx = normals[i, 0] * u[0] + normals[i, 1] * u[1] + normals[i, 2] * u[2]
+        ny = normals[i, 0] * v[0] + normals[i, 1] * v[1] + normals[i, 2] * v[2]
+        if abs(x * nx + y * ny) > _LEAST_COSINE * rho:
             sector = int((np.arctan2(y, x) + np.pi) * (_SECTORS / (2.0 * np.pi))) % _SECTORS
-            sectors[sector] += weight[i] * (1.0 - miss * miss)
+            sectors[sector] += sites.weight[i] * (1.0 - miss * miss)
     return float(np.sqrt(sectors).sum())
 
 
 @njit(cache=True)
-def _worths(
-    points: FloatArray,
-    across: FloatArray,
-    weight: FloatArray,
-    centres: FloatArray,
-    axes: FloatArray,
-    radii: FloatArray,
-    slack: float,
-) -> FloatArray:
-    """The worth of each of many cylinders."""
+def _agreements(sites: _Sites, centres: FloatArray, axes: FloatArray, radii: FloatArray, slack: float) -> FloatArray:
+    """The agreement (H,) of sites with each of many cylinders, within `slack` [m] and a share of the radius."""
     out = np.zeros(len(radii))
     for h in range(len(radii)):
-        out[h] = _worth(points, across, weight, centres[h], axes[h], radii[h], slack + 0.03 * radii[h])
+        out[h] = _agreement(sites, centres[h], axes[h], radii[h], slack + _SHARE * radii[h])
     return out
 
 
 @njit(cache=True)
-def _sharpened(
-    points: FloatArray,
-    across: FloatArray,
-    weight: FloatArray,
+def _refined(
+    sites: _Sites,
     centre: FloatArray,
     axis: FloatArray,
     radius: float,
     sigma: float,
     steps: FloatArray,
-    least: float,
-    most: float,
+    radius_range: tuple[float, float],
 ) -> tuple[float, FloatArray, FloatArray, float]:
-    """Climb to the best cylinder near the given one by random steps (S, 7) that shrink, as the tolerance does."""
-    narrow = 3.0 * sigma
-    wide = narrow + 0.03 * radius
+    """Agreement, point on the axis, direction and radius of the best cylinder near the given one, by random search.
+
+    Of the steps (S, 7), which shrink like the tolerance, each that improves the agreement is taken: three numbers turn
+    the axis, three move it, one scales the radius.
+    """
+    narrow = _SIGMAS * sigma
+    wide = narrow + _SHARE * radius
     best = 0.0
     for turn in range(len(steps)):
         done = turn / len(steps)
         tolerance = wide * (narrow / wide) ** done
         size = _FIRST_STEP * (_LAST_STEP / _FIRST_STEP) ** done
-        if turn % 40 == 0:
-            best = _worth(points, across, weight, centre, axis, radius, tolerance)
+        if turn % _SAME_TOLERANCE == 0:
+            best = _agreement(sites, centre, axis, radius, tolerance)
         step = steps[turn]
         turned = axis + size * step[:3]
         turned /= np.sqrt(turned @ turned)
         moved = centre + size * radius * step[3:6]
         other = radius * np.exp(size * step[6])
-        if other < least or other > most:
+        if other < radius_range[0] or other > radius_range[1]:
             continue
-        worth = _worth(points, across, weight, moved, turned, other, tolerance)
-        if worth > best:
-            best, centre, axis, radius = worth, moved, turned, other
-    return _worth(points, across, weight, centre, axis, radius, narrow), centre, axis, radius
+        value = _agreement(sites, moved, turned, other, tolerance)
+        if value > best:
+            best, centre, axis, radius = value, moved, turned, other
+    return _agreement(sites, centre, axis, radius, narrow), centre, axis, radius
