@@ -29,7 +29,6 @@ ALLOWED_IN_NODES = {"pipeprog_node", "pipeprog_msgs"}
 # The modules beside the cores' node.py that speak ROS.
 GLUE = {
     "pipeprog_node": {"parameters", "qos", "diagnostics", "discovery", "messages", "main", "worker"},
-    "pipeprog_sfm": {"motion_input", "map_output"},
     "pipeprog_bringup": {"replay", "session", "connections", "player", "listener", "survey_writer"},
 }
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
@@ -112,7 +111,7 @@ def test_only_nodes_and_their_glue_know_ros(path: Path) -> None:
 def test_imports_cross_packages_in_one_direction(path: Path) -> None:
     package = owner(path)
     allowed = {package, "pipeprog_camera"} | ALLOWED[package]
-    if package in CORES and (path.stem == "node" or path.stem in GLUE.get(package, ())):
+    if package in CORES and path.stem == "node":
         allowed |= ALLOWED_IN_NODES
     assert {name for name in imports(path) if name == "pipeprog" or name.startswith("pipeprog_")} <= allowed
 

@@ -4,16 +4,22 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point, Quaternion, Vector3
+from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, CompressedImage
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, PointCloud2
 from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
@@ -26,9 +32,9 @@ from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.journal import Journal
-from pipeprog_sfm.map_output import MapOutput
-from pipeprog_sfm.motion_input import MotionInput
-from pipeprog_sfm.reconstruction import Status
+from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, Transform
+from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
+from pipeprog_sfm.sparse.overlap import OverlapReport
 from pipeprog_sfm.supervisor import MAX_BACKLOG, ReconstructionLostError, Supervisor
 from pipeprog_sfm.worker import (
     AddKeyframe,
@@ -44,6 +50,155 @@ from pipeprog_sfm.worker import (
 )
 
 STATUS_PERIOD = 0.2  # s, at most, from a message of motion to the status that counts it
+MAX_MOTION = 1000  # messages of odometry, TF or IMU that wait for this process: a second and more of the fastest IMU
+
+
+class MotionInput:
+    """Subscribes to what a robot tells about its motion; `considered` counts messages, TF's by their transforms.
+
+    reliable: no message may be lost, as in a replay; live, drivers send best effort.
+    """
+
+    def __init__(self, node: Node, reliable: bool) -> None:
+        self.considered = 0
+        self._logger = node.get_logger()
+        self._transforms: list[Transform] = []  # since the last keyframe, as are the accelerations
+        self._accelerations: list[Acceleration] = []
+        source = qos.reliable(MAX_MOTION) if reliable else qos.sensor(MAX_MOTION)
+        subscribe = partial(node.create_subscription, qos_overriding_options=qos.OVERRIDABLE)
+        subscribe(Odometry, "odometry", self._on_odometry, source)
+        subscribe(Imu, "imu", self._on_imu, source)
+        subscribe(TFMessage, "/tf", partial(self._on_transforms, static=False), source)
+        subscribe(TFMessage, "/tf_static", partial(self._on_transforms, static=True), qos.kept(MAX_MOTION))
+
+    def take(self) -> RobotMotion:
+        """What has come since the last call."""
+        motion = RobotMotion(tuple(self._transforms), tuple(self._accelerations))
+        self._transforms, self._accelerations = [], []
+        return motion
+
+    def _on_odometry(self, message: Odometry) -> None:
+        pose = message.pose.pose
+        self._add(message.header, message.child_frame_id, pose.position, pose.orientation, static=False)
+
+    def _on_transforms(self, message: TFMessage, static: bool) -> None:
+        for transform in message.transforms:
+            edge = transform.transform
+            self._add(transform.header, transform.child_frame_id, edge.translation, edge.rotation, static)
+
+    def _add(
+        self, header: Header, child: str, position: Point | Vector3, orientation: Quaternion, static: bool
+    ) -> None:
+        self.considered += 1
+        x, y, z = position.x, position.y, position.z
+        values = np.array([x, y, z, orientation.x, orientation.y, orientation.z, orientation.w])
+        if not header.frame_id or not child or not np.isfinite(values).all() or not values[3:].any():
+            self._logger.warning(
+                f"a transform from '{header.frame_id}' to '{child}' cannot be used: it wants both names and a rotation",
+                throttle_duration_sec=10.0,
+            )
+            return
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
+        # tf2 takes names with and without the leading slash of ROS 1 for the same.
+        names = header.frame_id.lstrip("/"), child.lstrip("/")
+        self._transforms.append(Transform(messages.stamp_ns(header.stamp), *names, pose, static))
+
+    def _on_imu(self, message: Imu) -> None:
+        self.considered += 1
+        force = message.linear_acceleration
+        values = np.array([force.x, force.y, force.z])
+        # REP 145: -1 says that there are no accelerations.
+        if message.linear_acceleration_covariance[0] >= 0 and np.isfinite(values).all():
+            stamp = messages.stamp_ns(message.header.stamp)
+            self._accelerations.append(Acceleration(stamp, message.header.frame_id.lstrip("/"), values))
+
+
+class MapOutput:
+    """Publishes events of the reconstruction as messages.
+
+    Attributes:
+        revision: maps published.
+        frame: where the map's origin is, in words; empty before the first map.
+        correction: distance [m] by which the last map moved the keyframe that it moved most.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.revision = 0
+        self.frame = ""
+        self.correction = 0.0
+        self._logger = node.get_logger()
+        self._map_stamp = self._pose_stamp = 0
+        self._map_trajectory: Trajectory | None = None
+        self._overlap = node.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.kept(50))
+        self._points = node.create_publisher(PointCloud2, "map_points", qos.latched())
+        self._poses = node.create_publisher(Path, "keyframe_poses", qos.latched())
+        self._statuses = node.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
+
+    def publish_overlap(self, header: Header, reports: Sequence[OverlapReport], keyframes: int, retired: int) -> None:
+        """Overlap after so far considered `keyframes` and `retired` messages of retirement."""
+        images = [
+            msg.ImageOverlap(
+                stamp=messages.time_msg(report.stamp),
+                registered=report.registered,
+                overlap=report.overlap,
+                cell_overlap=report.cell_overlap,
+                tie_points=report.tie_points,
+                features=report.features,
+                matches_previous=report.matches_previous,
+                matches_next=report.matches_next,
+            )
+            for report in reports
+        ]
+        self._overlap.publish(
+            msg.ImageOverlapArray(
+                header=header, keyframes_considered=keyframes, retirements_considered=retired, images=images
+            )
+        )
+
+    def publish_poses(self, trajectory: Trajectory) -> Header:
+        """Poses in `map`; returns the header under which they were published."""
+        # Stamps of two publications differ by a nanosecond at least, so that cloud and poses of a map can be paired.
+        self._pose_stamp = max(int(trajectory.stamps[-1]), self._pose_stamp + 1)
+        header = messages.header(self._pose_stamp, "map")
+        self._poses.publish(messages.path(header, trajectory.stamps, trajectory.map_from_camera))
+        return header
+
+    def publish_map(self, metric_map: MetricMap) -> None:
+        """Poses and cloud of a new map, both under the same stamp."""
+        self.revision += 1
+        header = self.publish_poses(metric_map.trajectory)
+        self._map_stamp = self._pose_stamp
+        if metric_map.scale.frame != self.frame:
+            self.frame = metric_map.scale.frame
+            self._logger.info(f"frame map: {self.frame}")
+        self.correction = metric_map.trajectory.correction(self._map_trajectory)
+        self._map_trajectory = metric_map.trajectory
+        cloud = metric_map.cloud
+        self._points.publish(
+            messages.point_cloud(header, cloud.points, colors=cloud.colors, normals=cloud.normals, views=cloud.views)
+        )
+
+    def publish_status(self, status: Status, stamp: int, motion_considered: int) -> None:
+        """Health; stamp [ns]: of the newest keyframe."""
+        scale = status.scale
+        self._statuses.publish(
+            msg.SfmStatus(
+                header=messages.header(stamp, "map"),
+                keyframes_seen=status.seen,
+                keyframes_registered=status.registered,
+                keyframes_waiting=status.waiting,
+                models=status.models,
+                map_revision=self.revision,
+                map_stamp=messages.time_msg(self._map_stamp),
+                reprojection_error=status.reprojection_error,
+                metric=scale is not None,
+                scale_source=scale.source if scale else "",
+                scale_sigma=scale.sigma if scale else np.nan,
+                motion_considered=motion_considered,
+                message=status.message,
+            )
+        )
 
 
 class SfmNode(Node):
