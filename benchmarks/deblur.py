@@ -26,7 +26,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import DeblurConfig, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
-from pipeprog_sfm.sparse.features import Features
+from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.types import EncodedImage
 

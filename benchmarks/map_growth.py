@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
-from pipeprog_sfm.sparse.features import Features, root_sift
+from pipeprog_sfm.features.sift import Features, root_sift
 from pipeprog_sfm.sparse.mapper import Mapper
 
 RESULTS = Path(__file__).parent / "results" / "map_growth.json"

@@ -48,7 +48,7 @@ from pipeprog_sfm.boards.board_file import load_board_file
 from pipeprog_sfm.boards.ellipses import detect_ellipses
 from pipeprog_sfm.config import BoardConfig, MapperConfig, StereoConfig
 from pipeprog_sfm.dense.stereo import StereoImage, choose_pairs, depth_map
-from pipeprog_sfm.sparse.features import extract
+from pipeprog_sfm.features.sift import extract
 
 FloatArray = NDArray[np.float64]
 IMAGES = ROOT / "docs" / "images"

@@ -34,7 +34,7 @@ GLUE = {
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
 # and all may import config.py and types.py.
 FOLDERS = {
-    "pipeprog_sfm": {"sparse": set(), "boards": set(), "metric": {"boards"}, "dense": set()},
+    "pipeprog_sfm": {"features": set(), "sparse": {"features"}, "boards": set(), "metric": {"boards"}, "dense": set()},
     "pipeprog_detect": {
         "cloud": set(),
         "silhouette": {"cloud"},

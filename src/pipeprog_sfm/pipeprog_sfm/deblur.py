@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.sparse.features import Features, extract
+from pipeprog_sfm.features.sift import Features, extract
 from pipeprog_sfm.types import EncodedImage
 
 MAX_GAP = 1_000_000_000  # ns between two poses that still give the velocity between them: a hand sways at 1 to 2 Hz

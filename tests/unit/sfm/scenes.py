@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import match
+from pipeprog_sfm.features.sift import Features, root_sift
 from pipeprog_sfm.sparse.bundle_adjustment import Bundle, rotation_from_vector
-from pipeprog_sfm.sparse.features import Features, root_sift
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import match
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.sparse.two_view import model_from_pair
 

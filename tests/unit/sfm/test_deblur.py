@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.deblur import between, blur, deblur, transfer, velocity
-from pipeprog_sfm.sparse.features import extract
-from pipeprog_sfm.sparse.matching import match
+from pipeprog_sfm.features.matching import match
+from pipeprog_sfm.features.sift import extract
 
 CAMERA = Camera(640, 400, 500.0, 500.0, 319.5, 199.5)
 DISTORTED = Camera(640, 400, 500.0, 500.0, 319.5, 199.5, "plumb_bob", (-0.1, 0.02, 0.0, 0.0, 0.0))

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import MatchArray, match_guided
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import MatchArray, match_guided
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 GUIDED_RADIUS = 4.0  # px around the epipolar segment, as POSE_ERROR: poses are known to a pixel or two

@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pipeprog_camera.arrays import IntArray
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import MatchArray
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import MatchArray
+from pipeprog_sfm.features.retrieval import Retrieval
 from pipeprog_sfm.sparse.registration import Location, locate
-from pipeprog_sfm.sparse.retrieval import Retrieval
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 

@@ -9,11 +9,11 @@ import scipy.sparse.linalg
 from scipy.linalg import expm, logm
 
 from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_sfm.features.retrieval import COARSE, PREVIEW
 from pipeprog_sfm.sparse.guided_matching import link, partners
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.model_merging import similarity_between
 from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS
-from pipeprog_sfm.sparse.retrieval import COARSE, PREVIEW
 from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import IntArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
-from pipeprog_sfm.sparse.features import Features, extract
-from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.retrieval import COARSE, Retrieval
+from pipeprog_sfm.features.sift import Features, extract
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, rejection_reason
-from pipeprog_sfm.sparse.retrieval import COARSE, Retrieval
 from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.sparse.two_view import model_from_pair

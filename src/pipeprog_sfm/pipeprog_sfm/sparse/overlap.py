@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import IntArray
-from pipeprog_sfm.sparse.keyframe import Keyframe, grid_cells, hull_area
+from pipeprog_sfm.features.keyframe import Keyframe, grid_cells, hull_area
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 NO_STAMP = -1

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import MatchArray
 from pipeprog_sfm.sparse.colmap import AbsolutePose, absolute_pose
 from pipeprog_sfm.sparse.guided_matching import link
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import MatchArray
 from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_views
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 

@@ -8,8 +8,8 @@ from collections.abc import Collection
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import MatchArray
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import MatchArray
 from pipeprog_sfm.sparse.model_adjustment import adjust_model, pose_covariance
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
 from pipeprog_sfm.sparse.registration import rejection_reason

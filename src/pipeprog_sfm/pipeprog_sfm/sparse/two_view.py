@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import MatchArray
 from pipeprog_sfm.sparse.colmap import relative_pose
 from pipeprog_sfm.sparse.guided_matching import link
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import MatchArray
 from pipeprog_sfm.sparse.model_adjustment import adjust_model
 from pipeprog_sfm.sparse.registration import POSE_ERROR
 from pipeprog_sfm.sparse.sparse_model import SparseModel

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from scenes import BASE, CAMERA, STEP, centre, keyframe, pose, started, view
 
+from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.sparse.guided_matching import link, partners
-from pipeprog_sfm.sparse.keyframe import Keyframe
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 

@@ -12,10 +12,10 @@ from scenes import CAMERA, STEP, blurred, centre, pose, position_errors, ring_po
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
-from pipeprog_sfm.sparse.features import Features, root_sift
+from pipeprog_sfm.features.matching import match
+from pipeprog_sfm.features.retrieval import Retrieval
+from pipeprog_sfm.features.sift import Features, root_sift
 from pipeprog_sfm.sparse.mapper import Mapper
-from pipeprog_sfm.sparse.matching import match
-from pipeprog_sfm.sparse.retrieval import Retrieval
 
 # [m] Of a point at 2 m, 0.3 px are 0.7 mm; 300 points that hold a camera leave 0.04 mm, which trading turn for shift
 # and the drift along 3 m of wall multiply by ten: 0.4 mm, and room for the largest error of fifteen cameras.

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scenes import CAMERA, STEP
 
-from pipeprog_sfm.sparse.features import Features
-from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.sparse.overlap import OverlapTracker
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 from scenes import CAMERA, STEP, blurred, centre, in_model, keyframe, matched, started
 
-from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.sparse.registration import add_view, locate, rejection_reason
 
 TOLERANCE = 0.02  # of the base: 0.3 px of 300 points at 2 m are some 3 mm of a view's place

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import CAMERA, STEP, in_model, matched, pose, started, view
 
-from pipeprog_sfm.sparse.keyframe import Keyframe
+from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.sparse.two_view import model_from_pair
 
 TOLERANCE = 0.02  # of the base: 0.3 px of 300 points at 2 m are some 3 mm of a view's place

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_sfm.sparse.features import root_sift
-from pipeprog_sfm.sparse.matching import match, match_guided
+from pipeprog_sfm.features.matching import match, match_guided
+from pipeprog_sfm.features.sift import root_sift
 
 COUNT = 400
 

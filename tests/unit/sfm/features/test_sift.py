@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
-from pipeprog_sfm.sparse.features import extract, root_sift
-from pipeprog_sfm.sparse.matching import match
+from pipeprog_sfm.features.matching import match
+from pipeprog_sfm.features.sift import extract, root_sift
 
 CONFIG = MapperConfig(max_features=500)
 

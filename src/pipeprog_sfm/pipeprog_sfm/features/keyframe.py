@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.sparse.features import Features
+from pipeprog_sfm.features.sift import Features
 
 GRID = (32, 18)
 

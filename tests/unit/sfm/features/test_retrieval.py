@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scenes import CAMERA, STEP, pose, view
 
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import MatchArray, match
-from pipeprog_sfm.sparse.retrieval import SUBSET, Retrieval
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import MatchArray, match
+from pipeprog_sfm.features.retrieval import SUBSET, Retrieval
 
 
 def keyframe(n: int, x: float) -> Keyframe:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import IntArray
-from pipeprog_sfm.sparse.keyframe import Keyframe
-from pipeprog_sfm.sparse.matching import MatchArray, match
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.features.matching import MatchArray, match
 
 PAIRS_REMEMBERED = 2000  # pairs of keyframes whose matches are kept: 10 MB
 SUBSET = 6  # views of a model that a keyframe is compared with at a time: the cost does not grow with the model
