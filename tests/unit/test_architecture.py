@@ -28,7 +28,17 @@ ALLOWED = {
 ALLOWED_IN_NODES = {"pipeprog_node", "pipeprog_msgs"}
 # The modules beside the cores' node.py that speak ROS.
 GLUE = {
-    "pipeprog_node": {"parameters", "qos", "diagnostics", "discovery", "messages", "main", "worker"},
+    "pipeprog_node": {
+        "parameters",
+        "qos",
+        "diagnostics",
+        "discovery",
+        "intake",
+        "messages",
+        "main",
+        "received",
+        "worker",
+    },
     "pipeprog_bringup": {"replay", "session", "connections", "player", "listener", "survey_writer"},
 }
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
@@ -61,6 +71,7 @@ DEPENDENCIES = {
     "numba": "python3-numba",
     "numpy": "python3-numpy",
     "jinja2": "python3-jinja2",
+    "PIL": "python3-pil",
     "rich": "python3-rich",
     "scipy": "python3-scipy",
     "sklearn": "python3-sklearn",

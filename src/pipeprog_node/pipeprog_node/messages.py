@@ -18,7 +18,7 @@ from std_msgs.msg import Header
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 
-_SECOND = 1_000_000_000
+SECOND = 1_000_000_000  # ns
 
 # Encoding -> bytes of one sample, channels, conversion to BGR or grey.
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
@@ -48,12 +48,12 @@ _FIELD_CODES = {name: code for code, name in _FIELD_TYPES.items()}
 
 def stamp_ns(stamp: Time) -> int:
     """Nanoseconds of a stamp."""
-    return stamp.sec * _SECOND + stamp.nanosec
+    return stamp.sec * SECOND + stamp.nanosec
 
 
 def time_msg(stamp: int) -> Time:
     """Stamp of nanoseconds."""
-    return Time(sec=stamp // _SECOND, nanosec=stamp % _SECOND)
+    return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
 
 
 def header(stamp: int, frame_id: str) -> Header:

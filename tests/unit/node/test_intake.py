@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the door of a node lets through."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from rclpy.qos import QoSProfile
+
+from pipeprog_camera.errors import InputError
+from pipeprog_node.intake import Intake, InvalidMessageError
+
+
+class FakeNode:
+    """Keeps the callbacks and what is logged."""
+
+    def __init__(self) -> None:
+        self.callbacks: dict[str, Callable[[Any], None]] = {}
+        self.logged: list[str] = []
+
+    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], *_: Any, **__: Any) -> None:
+        self.callbacks[topic] = callback
+
+    def get_logger(self) -> FakeNode:
+        return self
+
+    def error(self, text: str) -> None:
+        self.logged.append(text)
+
+    def resolve_topic_name(self, topic: str) -> str:
+        return f"/site/{topic}"
+
+
+def positive(value: int) -> float:
+    if value == 0:
+        raise InputError("zero")
+    if value < 0:
+        raise InvalidMessageError("sign", f"{value} is negative")
+    return float(value)
+
+
+@pytest.fixture
+def node() -> FakeNode:
+    return FakeNode()
+
+
+def test_only_what_can_be_converted_is_used(node: FakeNode) -> None:
+    used: list[float] = []
+    intake = Intake(node)
+    intake.subscribe(int, "numbers", positive, used.append, QoSProfile(depth=1))
+    for value in (1, -2, 3, 0, -4):
+        node.callbacks["numbers"](value)
+    assert used == [1.0, 3.0]
+    assert intake.rejected == 3
+    assert intake.health() == {"dropped on numbers: invalid": 1, "dropped on numbers: sign": 2}
+
+
+def test_each_kind_is_said_once(node: FakeNode) -> None:
+    intake = Intake(node)
+    intake.subscribe(int, "numbers", positive, lambda value: None, QoSProfile(depth=1))
+    for value in (-2, -4, -2, 0, 0):
+        node.callbacks["numbers"](value)
+    assert [line.partition(";")[0] for line in node.logged] == [
+        "dropped a message on /site/numbers: -2 is negative",
+        "dropped a message on /site/numbers: zero",
+    ]
