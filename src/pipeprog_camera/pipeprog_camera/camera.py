@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.encoded_image import check_size
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import (
+    MAX_CORNER_SHIFT,
+    MAX_DISTORTION_COEFFICIENTS,
+    MAX_FOCAL,
+    MAX_OFF_CENTRE,
+    MAX_PIXEL_ASPECT,
+    MIN_FOCAL,
+)
 
 # Number of coefficients that each ROS distortion model may carry.
 DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
@@ -49,7 +58,11 @@ class Camera:
         model = _ALIASES.get(self.distortion_model, self.distortion_model)
         if model not in DISTORTION_MODELS:
             raise InputError(
-                f"unknown distortion model '{self.distortion_model}': use one of {', '.join(DISTORTION_MODELS)}"
+                f"unknown distortion model {self.distortion_model[:40]!r}: use one of {', '.join(DISTORTION_MODELS)}"
+            )
+        if len(self.distortion) > MAX_DISTORTION_COEFFICIENTS:
+            raise InputError(
+                f"{len(self.distortion)} distortion coefficients: no model has more than {MAX_DISTORTION_COEFFICIENTS}"
             )
         coefficients = tuple(float(value) for value in self.distortion)
         if len(coefficients) not in DISTORTION_MODELS[model] and any(coefficients):
@@ -70,9 +83,13 @@ class Camera:
         distortion_model: str = "plumb_bob",
         distortion: Sequence[float] = (),
     ) -> Camera:
-        """Camera from the row-major (3, 3) or (9,) matrix K; raises InputError where it is not calibrated."""
+        """Camera from the row-major (3, 3) or (9,) matrix K; raises InputError where it is none of a real camera."""
         matrix = np.asarray(k, float).reshape(3, 3)
-        return cls(
+        if not np.isfinite(matrix).all() or np.tril(matrix, -1).any():
+            raise InputError(
+                f"K = {matrix.ravel().tolist()} is no camera matrix: it is fx 0 cx, 0 fy cy, 0 0 1 by rows"
+            )
+        camera = cls(
             int(width),
             int(height),
             matrix[0, 0],
@@ -82,6 +99,8 @@ class Camera:
             distortion_model,
             tuple(distortion),
         )
+        _check_plausible(camera)
+        return camera
 
     @property
     def matrix(self) -> FloatArray:
@@ -141,4 +160,33 @@ class Camera:
             fy=self.fy * factor,
             cx=(self.cx + 0.5) * factor - 0.5,
             cy=(self.cy + 0.5) * factor - 0.5,
+        )
+
+
+def _check_plausible(camera: Camera) -> None:
+    """Raises InputError for a calibration that no lens has: every measurement with it would be wrong."""
+    check_size(camera.width, camera.height)
+    width, height = camera.width, camera.height
+    longer = max(width, height)
+    focal = np.array([camera.fx, camera.fy])
+    if (
+        not (MIN_FOCAL * longer <= focal.min() and focal.max() <= MAX_FOCAL * longer)
+        or focal.max() > MAX_PIXEL_ASPECT * focal.min()
+    ):
+        raise InputError(
+            f"focal lengths of {camera.fx:g} and {camera.fy:g} pixels fit no lens before an image of "
+            f"{width} x {height}: is the calibration in pixels, and for this size?"
+        )
+    place = np.array([camera.cx / width, camera.cy / height])  # 0 to 1 inside the image
+    if place.min() < -MAX_OFF_CENTRE or place.max() > 1.0 + MAX_OFF_CENTRE:
+        raise InputError(
+            f"the principal point ({camera.cx:g}, {camera.cy:g}) is far outside an image of {width} x {height}: "
+            "calibrate the camera at the size that it sends"
+        )
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+    shift = np.hypot(*(camera.distort_points(corners) - corners).T).max()
+    if not shift <= MAX_CORNER_SHIFT * np.hypot(width, height):  # NaN, too
+        raise InputError(
+            f"distortion coefficients {camera.distortion} move a corner of the image by {shift:.3g} pixels: "
+            "calibrate the camera again"
         )

@@ -12,6 +12,14 @@ MIN_SIDE = 32  # px; below, not one window of the tracker fits between the borde
 MAX_ENCODED_IMAGE = 1 << 28  # bytes; four for each pixel at MAX_PIXELS: raw frames with an alpha channel
 MAX_JPEG_SCANS = 100  # progressive JPEGs have about 10; the decoder passes over the whole image once a scan
 
+# Cameras; lengths relative to the longer side of the image, so that they hold at every resolution.
+MIN_FOCAL = 0.1  # of the longer side; a circular fisheye of 220 degrees, its circle 0.4 of the sensor's width, has 0.1
+MAX_FOCAL = 100.0  # of the longer side; a field of view of 0.6 degrees, beyond the longest zoom lens of a robot (2)
+MAX_PIXEL_ASPECT = 4.0  # fx / fy or its inverse; 2 for the fields of interlaced video and for anamorphic lenses
+MAX_OFF_CENTRE = 1.0  # image sizes from the border to a principal point outside: a corner cut out of a larger image
+MAX_CORNER_SHIFT = 1.0  # diagonals by which distortion moves a corner; the strongest barrel lenses stay below 0.5
+MAX_DISTORTION_COEFFICIENTS = 14  # of rational_polynomial, the longest model
+
 # Clouds and trajectories.
 MAX_CLOUD_POINTS = 1 << 26  # points; 67 million: a building at 5 mm; 1.6 GB as coordinates in double precision
 MAX_POSES = 100_000  # keyframes; 14 hours at two a second

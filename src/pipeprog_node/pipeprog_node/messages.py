@@ -92,10 +92,15 @@ def compressed_image(stamp: int, frame_id: str, encoded: bytes) -> CompressedIma
 
 def camera_from_info(message: CameraInfo) -> Camera:
     """The calibrated camera; raises InputError where it is not calibrated, or for a part of the sensor only."""
-    if message.binning_x > 1 or message.binning_y > 1 or message.roi.x_offset or message.roi.y_offset:
+    roi = message.roi
+    is_part = (
+        roi.x_offset or roi.y_offset or roi.width not in (0, message.width) or roi.height not in (0, message.height)
+    )
+    if message.binning_x > 1 or message.binning_y > 1 or is_part:
         raise InputError(
-            f"CameraInfo has binning {message.binning_x} x {message.binning_y} and a region of interest at "
-            f"({message.roi.x_offset}, {message.roi.y_offset}): publish the calibration of the image as it is sent"
+            f"CameraInfo has binning {message.binning_x} x {message.binning_y} and a region of interest of "
+            f"{roi.width} x {roi.height} at ({roi.x_offset}, {roi.y_offset}): "
+            "publish the calibration of the image as it is sent"
         )
     return Camera.from_calibration(message.width, message.height, message.k, message.distortion_model, message.d)
 

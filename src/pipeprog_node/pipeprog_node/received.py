@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_msgs.msg import Header
 
+from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_NAME
@@ -24,6 +25,15 @@ class ReceivedImage:
     encoded: bytes
     width: int
     height: int
+
+
+@dataclass(frozen=True)
+class ReceivedCamera:
+    """A calibration: stamp [ns] and frame of the image that it belongs to, and the camera."""
+
+    stamp: int
+    frame_id: str
+    camera: Camera
 
 
 def stamp_and_frame(header: Header) -> tuple[int, str]:
@@ -47,3 +57,12 @@ def compressed_image(message: CompressedImage) -> ReceivedImage:
     except InputError as error:
         raise InvalidMessageError("image", str(error)) from None
     return ReceivedImage(stamp, frame_id, encoded, width, height)
+
+
+def camera_info(message: CameraInfo) -> ReceivedCamera:
+    """The calibration of a whole image, with values that a real camera can have."""
+    stamp, frame_id = stamp_and_frame(message.header)
+    try:
+        return ReceivedCamera(stamp, frame_id, messages.camera_from_info(message))
+    except InputError as error:
+        raise InvalidMessageError("calibration", str(error)) from None
