@@ -190,3 +190,19 @@ def _check_plausible(camera: Camera) -> None:
             f"distortion coefficients {camera.distortion} move a corner of the image by {shift:.3g} pixels: "
             "calibrate the camera again"
         )
+
+
+def check_whole_sensor(
+    size: tuple[int, int], binning: tuple[int, int], offset: tuple[int, int], region: tuple[int, int]
+) -> None:
+    """Raises InputError where a CameraInfo is of binned pixels or of a region of the sensor: K would be another.
+
+    All are (x, y) in pixels: the image's size, pixels that are one, the region's corner and its size (0: all of it).
+    """
+    is_part = any(offset) or any(part not in (0, whole) for part, whole in zip(region, size, strict=True))
+    if max(binning) > 1 or is_part:
+        raise InputError(
+            f"CameraInfo has binning {binning[0]} x {binning[1]} and a region of interest of "
+            f"{region[0]} x {region[1]} at ({offset[0]}, {offset[1]}): publish the calibration of the image as it is "
+            "sent"
+        )

@@ -15,23 +15,18 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
-from pipeprog_camera.camera import Camera
+from pipeprog_camera.camera import Camera, check_whole_sensor
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.raw_image import SAMPLES, check_layout
 
 SECOND = 1_000_000_000  # ns
 
-# Encoding -> bytes of one sample, channels, conversion to BGR or grey.
-_ENCODINGS: dict[str, tuple[int, int, int | None]] = {
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
-    "mono16": (2, 1, None),
-    "16UC1": (2, 1, None),
-    "bgr8": (1, 3, None),
-    "8UC3": (1, 3, None),
-    "rgb8": (1, 3, cv2.COLOR_RGB2BGR),
-    "bgra8": (1, 4, cv2.COLOR_BGRA2BGR),
-    "8UC4": (1, 4, cv2.COLOR_BGRA2BGR),
-    "rgba8": (1, 4, cv2.COLOR_RGBA2BGR),
+# Conversion to BGR of the encodings that are neither grey nor BGR.
+_TO_BGR = {
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "8UC4": cv2.COLOR_BGRA2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGR,
 }
 _FIELD_TYPES = {
     PointField.INT8: "i1",
@@ -63,19 +58,15 @@ def header(stamp: int, frame_id: str) -> Header:
 
 def image_from_msg(message: Image) -> NDArray[np.uint8]:
     """(H, W) grey or (H, W, 3) BGR; raises InputError where the encoding or the size is none that can be used."""
-    if message.encoding not in _ENCODINGS:
-        raise InputError(f"images are encoded as '{message.encoding}': publish one of {', '.join(_ENCODINGS)}")
-    size, channels, conversion = _ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     data = np.frombuffer(message.data, np.uint8)
-    if not height or not width or step < width * channels * size or len(data) < height * step:
-        raise InputError(
-            f"damaged image: {width} x {height} {message.encoding} with rows of {step} bytes are not {len(data)} bytes"
-        )
+    check_layout(width, height, message.encoding, step, len(data))
+    size, channels = SAMPLES[message.encoding]
     rows = data[: height * step].reshape(height, step)[:, : width * channels * size]
     if size == 2:
         return _to_8_bits(np.ascontiguousarray(rows).view(">u2" if message.is_bigendian else "<u2"))
     image = np.ascontiguousarray(rows) if channels == 1 else np.ascontiguousarray(rows).reshape(height, width, channels)
+    conversion = _TO_BGR.get(message.encoding)
     return image if conversion is None else cv2.cvtColor(image, conversion).astype(np.uint8, copy=False)
 
 
@@ -93,15 +84,12 @@ def compressed_image(stamp: int, frame_id: str, encoded: bytes) -> CompressedIma
 def camera_from_info(message: CameraInfo) -> Camera:
     """The calibrated camera; raises InputError where it is not calibrated, or for a part of the sensor only."""
     roi = message.roi
-    is_part = (
-        roi.x_offset or roi.y_offset or roi.width not in (0, message.width) or roi.height not in (0, message.height)
+    check_whole_sensor(
+        (message.width, message.height),
+        (message.binning_x, message.binning_y),
+        (roi.x_offset, roi.y_offset),
+        (roi.width, roi.height),
     )
-    if message.binning_x > 1 or message.binning_y > 1 or is_part:
-        raise InputError(
-            f"CameraInfo has binning {message.binning_x} x {message.binning_y} and a region of interest of "
-            f"{roi.width} x {roi.height} at ({roi.x_offset}, {roi.y_offset}): "
-            "publish the calibration of the image as it is sent"
-        )
     return Camera.from_calibration(message.width, message.height, message.k, message.distortion_model, message.d)
 
 
