@@ -20,7 +20,7 @@ MODULES = [path for package in PYTHON_PACKAGES for path in sorted((package / pac
 CORES = {"pipeprog_frames", "pipeprog_sfm", "pipeprog_detect"}
 ALLOWED = {
     "pipeprog_camera": set(),
-    "pipeprog_node": set(),
+    "pipeprog_node": {"pipeprog_msgs"},
     **{core: set() for core in CORES},
     "pipeprog_bringup": {*CORES, "pipeprog_node", "pipeprog_msgs"},
     "pipeprog": {*CORES, "pipeprog_bringup"},

@@ -25,6 +25,15 @@ MAX_CLOUD_POINTS = 1 << 26  # points; 67 million: a building at 5 mm; 1.6 GB as 
 MAX_POSES = 100_000  # keyframes; 14 hours at two a second
 MAX_COORDINATE = 1e8  # m; beyond the coordinates of any map projection (UTM: 1e7)
 
+# What a robot tells about its motion, and keyframes on their way to the reconstruction.
+MAX_QUATERNION_ERROR = 0.01  # of the norm: four components typed with two decimals are off by 0.005 each, 0.01 in all
+MAX_ACCELERATION = 1e4  # m/s^2; a thousand times gravity, beyond any accelerometer of a robot
+MAX_TRANSFORMS = 1000  # transforms of one TFMessage; a humanoid with two hands has a hundred joints
+MAX_TRANSFORM_FRAMES = 10_000  # names of frames from TF, odometry and IMU: a hundred robots of a hundred frames
+MAX_WAITING_MOTION = 200_000  # transforms or accelerations since the last keyframe; 100 s of a large TF tree, 60 MB
+MAX_UNPAIRED = 50  # images without calibration, or the reverse: as deep as the keyframes' topic
+MAX_CAMERAS = 64  # keyframes of one moment: more cameras than any robot has
+
 # Texts and times.
 MAX_NAME = 256  # characters of a frame or class name; ROS 2 limits topic names to as many
 MAX_SECONDS = 2**31 - 1  # s; builtin_interfaces/Time has 32 bits with a sign
