@@ -41,14 +41,20 @@ class Intake:
         use: Callable[[Value], None],
         profile: QoSProfile,
         overriding: QoSOverridingOptions | None = None,
+        dropped: Callable[[Message], None] | None = None,
     ) -> Subscription:
-        """Subscribes; `use` gets what `convert` makes of each message for which it raises no InputError."""
+        """Subscribes; `use` gets what `convert` makes of each message for which it raises no InputError.
+
+        `dropped` gets the others, for nodes in which something waits for them.
+        """
 
         def receive(message: Message) -> None:
             try:
                 value = convert(message)
             except InputError as error:
                 self.reject(topic, error)
+                if dropped is not None:
+                    dropped(message)
                 return
             use(value)
 

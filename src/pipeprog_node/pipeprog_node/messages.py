@@ -17,6 +17,7 @@ from std_msgs.msg import Header
 
 from pipeprog_camera.camera import Camera, check_whole_sensor
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_CLOUD_FIELDS, MAX_CLOUD_POINTS, MAX_NAME, MAX_QUATERNION_ERROR
 from pipeprog_camera.raw_image import SAMPLES, check_layout
 
 SECOND = 1_000_000_000  # ns
@@ -38,6 +39,7 @@ _FIELD_TYPES = {
     PointField.FLOAT32: "f4",
     PointField.FLOAT64: "f8",
 }
+_NORMALS = ("normal_x", "normal_y", "normal_z")
 _FIELD_CODES = {name: code for code, name in _FIELD_TYPES.items()}
 
 
@@ -119,14 +121,25 @@ def path(path_header: Header, stamps: NDArray[np.int64], map_from_camera: NDArra
 
 
 def poses_from_path(message: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(N,) stamps [ns] and (N, 4, 4) poses of a path."""
+    """(N,) stamps [ns] and (N, 4, 4) poses of a path; raises InputError where a pose is no position and rotation."""
     stamps = np.array([stamp_ns(pose.header.stamp) for pose in message.poses], np.int64)
-    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
-    for pose, stamped in zip(poses, message.poses, strict=True):
+    positions, quaternions = np.zeros((len(stamps), 3)), np.zeros((len(stamps), 4))
+    for row, stamped in enumerate(message.poses):
         position, orientation = stamped.pose.position, stamped.pose.orientation
-        quaternion = [orientation.x, orientation.y, orientation.z, orientation.w]
-        pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-        pose[:3, 3] = position.x, position.y, position.z
+        positions[row] = position.x, position.y, position.z
+        quaternions[row] = orientation.x, orientation.y, orientation.z, orientation.w
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(~np.isfinite(positions).all(axis=1) | ~(np.abs(norms - 1.0) <= MAX_QUATERNION_ERROR))
+    if len(wrong):
+        raise InputError(
+            f"pose {wrong[0]} of the path has the position {_listed(positions[wrong[0]])} and the quaternion "
+            f"{_listed(quaternions[wrong[0]])}: finite metres and a norm of 1 are needed"
+        )
+    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+    if len(stamps):
+        poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+        poses[:, :3, 3] = positions
     return stamps, poses
 
 
@@ -176,35 +189,63 @@ def point_cloud(
 
 
 def table_from_cloud(message: PointCloud2) -> NDArray[np.void]:
-    """(N,) structured array of the cloud's fields, a view of the message; raises InputError where they do not fit."""
-    order = ">" if message.is_bigendian else "<"
-    try:
-        layout = np.dtype(
-            {
-                "names": [field.name for field in message.fields],
-                "formats": [
-                    (order + _FIELD_TYPES[field.datatype], (field.count,))
-                    if field.count > 1
-                    else order + _FIELD_TYPES[field.datatype]
-                    for field in message.fields
-                ],
-                "offsets": [field.offset for field in message.fields],
-                "itemsize": message.point_step,
-            }
+    """(N,) structured array of the cloud's fields; raises InputError where fields, sizes and data do not fit.
+
+    It is a view of the message, unless its rows are padded.
+    """
+    width, height, step = message.width, message.height, message.point_step
+    if width * height > MAX_CLOUD_POINTS:
+        raise InputError(f"a point cloud of {width} x {height} points is too large: {MAX_CLOUD_POINTS} at most")
+    if len(message.fields) > MAX_CLOUD_FIELDS:
+        raise InputError(f"a point cloud of {len(message.fields)} fields is none: {MAX_CLOUD_FIELDS} at most")
+    layout = _layout(message)
+    row_step = message.row_step if height > 1 else width * step
+    if row_step < width * step or len(message.data) < row_step * height:
+        raise InputError(
+            f"damaged point cloud: {width} x {height} points of {step} bytes in rows of {row_step} bytes "
+            f"are not {len(message.data)} bytes"
         )
-        return np.frombuffer(message.data, layout, count=message.width * message.height)
-    except (KeyError, ValueError) as error:
-        raise InputError(f"damaged point cloud: {error}") from None
+    if row_step == width * step:
+        return np.frombuffer(message.data, layout, count=width * height)
+    rows = np.frombuffer(message.data, np.uint8, count=row_step * height).reshape(height, row_step)
+    return np.ascontiguousarray(rows[:, : width * step]).view(layout).reshape(-1)
+
+
+def _layout(message: PointCloud2) -> np.dtype[np.void]:
+    """The type of one point; raises InputError where a field is of an unknown type or lies outside of the point."""
+    step, order = message.point_step, ">" if message.is_bigendian else "<"
+    names, formats = [], []
+    for field in message.fields:
+        name = field.name[:MAX_NAME]
+        if field.datatype not in _FIELD_TYPES:
+            raise InputError(f"damaged point cloud: the field {name!r} has the unknown datatype {field.datatype}")
+        kind, count = np.dtype(order + _FIELD_TYPES[field.datatype]), max(field.count, 1)
+        if field.offset + count * kind.itemsize > step:
+            raise InputError(
+                f"damaged point cloud: the field {name!r} of {count} x {kind.itemsize} bytes at {field.offset} "
+                f"lies outside of the {step} bytes of a point"
+            )
+        if not name or name in names:
+            raise InputError(f"damaged point cloud: a second field {name!r}, or one without a name")
+        names.append(name)
+        formats.append(kind if count == 1 else np.dtype((kind, (count,))))
+    if not names:
+        raise InputError("the point cloud has no fields: x, y and z are needed")
+    offsets = [field.offset for field in message.fields]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
 
 
 def points_from_cloud(message: PointCloud2) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """(N, 3) points [m] and (N, 3) unit normals, None where the cloud has none."""
+    """(N, 3) points [m] and (N, 3) normals, None where the cloud has none; raises InputError without x, y and z."""
     table = table_from_cloud(message)
     names = table.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
-        raise InputError(f"the point cloud has the fields {', '.join(names)}: x, y and z are needed")
-    points = _columns(table, "x", "y", "z")
-    return points, _columns(table, "normal_x", "normal_y", "normal_z") if "normal_x" in names else None
+        listed = ", ".join(names)[:MAX_NAME]
+        raise InputError(f"the point cloud has the fields {listed}: x, y and z are needed")
+    normals = [name for name in _NORMALS if name in names]
+    if len(normals) not in (0, 3):
+        raise InputError(f"the point cloud has {' and '.join(normals)} alone: normals are all three or none")
+    return _columns(table, "x", "y", "z"), _columns(table, *_NORMALS) if normals else None
 
 
 def colors_from_cloud(message: PointCloud2) -> NDArray[np.uint8] | None:
@@ -212,12 +253,22 @@ def colors_from_cloud(message: PointCloud2) -> NDArray[np.uint8] | None:
     table = table_from_cloud(message)
     if "rgb" not in (table.dtype.names or ()):
         return None
-    packed = np.ascontiguousarray(table["rgb"]).view(np.uint32)
+    if table.dtype["rgb"].itemsize != 4:
+        raise InputError(f"the point cloud's field rgb has {table.dtype['rgb'].itemsize} bytes: 4 are needed")
+    packed = np.ascontiguousarray(table["rgb"]).view(np.uint32).reshape(-1)
     return np.c_[packed >> 16 & 255, packed >> 8 & 255, packed & 255].astype(np.uint8)
 
 
 def _columns(table: NDArray[np.void], *names: str) -> NDArray[np.float32]:
-    return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+    several = [name for name in names if table.dtype[name].shape]
+    if several:
+        raise InputError(f"the point cloud's field {several[0]} has several values for each point: one is needed")
+    with np.errstate(over="ignore"):  # infinity is what becomes of numbers beyond single precision
+        return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+
+
+def _listed(values: NDArray[np.float64]) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)})"
 
 
 def _to_8_bits(image: NDArray) -> NDArray[np.uint8]:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Quaternion, Vector3
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, CompressedImage, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, PointCloud2
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
@@ -23,12 +23,13 @@ from pipeprog_camera.limits import (
     MAX_ACCELERATION,
     MAX_COORDINATE,
     MAX_NAME,
+    MAX_NORMAL_ERROR,
     MAX_POSES,
     MAX_QUATERNION_ERROR,
     MAX_SECONDS,
     MAX_TRANSFORMS,
 )
-from pipeprog_msgs.msg import KeyframesRetired
+from pipeprog_msgs.msg import KeyframesRetired, SfmStatus
 from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
 
@@ -88,6 +89,34 @@ class ReceivedRetirement:
     frame_id: str
     keyframes_published: int
     stamps: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ReceivedCloud:
+    """A map's points: stamp [ns], points (N, 3) [m] and their unit normals (N, 3), None where it has none."""
+
+    stamp: int
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
+class ReceivedPoses:
+    """Poses of keyframes: stamp [ns] of the publication, stamps (N,) [ns] of the keyframes, poses (N, 4, 4) [m]."""
+
+    stamp: int
+    stamps: NDArray[np.int64]
+    map_from_camera: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ReceivedStatus:
+    """Health of the reconstruction: stamp [ns] and number of its last map (0: none yet), scale as in SfmStatus."""
+
+    stamp: int
+    revision: int
+    scale_source: str
+    scale_sigma: float
 
 
 def stamp_and_frame(header: Header) -> tuple[int, str]:
@@ -204,3 +233,79 @@ def _transform(
 def _frame(name: str) -> str:
     """tf2 takes names with and without the leading slash of ROS 1 for the same."""
     return name.lstrip("/")
+
+
+def map_points(message: PointCloud2) -> ReceivedCloud:
+    """The points that have finite coordinates (and normals) within MAX_COORDINATE; the others are left out.
+
+    Single points without coordinates are usual, is_dense announces them; a cloud of nothing else is refused, and one
+    with a normal of another length than 1.
+    """
+    stamp, _ = stamp_and_frame(message.header)
+    try:
+        points, normals = messages.points_from_cloud(message)
+    except InputError as error:
+        raise InvalidMessageError("point cloud", str(error)) from None
+    points, normals = _usable(points, normals)
+    if not len(points):
+        raise InvalidMessageError(
+            "empty cloud",
+            f"not one of {message.width * message.height} points has finite coordinates: check its source",
+        )
+    if normals is not None:
+        squares = np.einsum("ij,ij->i", normals, normals)
+        shortest, longest = float(squares.min()) ** 0.5, float(squares.max()) ** 0.5
+        if shortest < 1.0 - MAX_NORMAL_ERROR or longest > 1.0 + MAX_NORMAL_ERROR:
+            raise InvalidMessageError(
+                "normals", f"normals are {shortest:g} to {longest:g} long: publish them with length 1, or none"
+            )
+    return ReceivedCloud(stamp, points, normals)
+
+
+def _usable(
+    points: NDArray[np.float32], normals: NDArray[np.float32] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """The rows whose values are finite and whose coordinates are in bounds; the arrays themselves where all are."""
+    if all(
+        not len(each) or (each.min() >= -limit and each.max() <= limit) for each, limit in _limited(points, normals)
+    ):
+        return points, normals  # a comparison with NaN is false
+    usable = np.logical_and.reduce([(np.abs(each) <= limit).all(axis=1) for each, limit in _limited(points, normals)])
+    return points[usable], None if normals is None else normals[usable]
+
+
+def _limited(
+    points: NDArray[np.float32], normals: NDArray[np.float32] | None
+) -> list[tuple[NDArray[np.float32], float]]:
+    largest = float(np.finfo(np.float32).max)
+    return [(points, MAX_COORDINATE)] + ([] if normals is None else [(normals, largest)])
+
+
+def keyframe_poses(message: Path) -> ReceivedPoses:
+    """Finite poses within MAX_COORDINATE, of keyframes that each have a stamp of their own."""
+    stamp, _ = stamp_and_frame(message.header)
+    if len(message.poses) > MAX_POSES:
+        raise InvalidMessageError("poses", f"a path of {len(message.poses)} poses: {MAX_POSES} at most are taken")
+    for pose in message.poses:
+        checked_stamp(pose.header.stamp)
+    try:
+        stamps, map_from_camera = messages.poses_from_path(message)
+    except InputError as error:
+        raise InvalidMessageError("poses", str(error)) from None
+    if len(np.unique(stamps)) < len(stamps):
+        raise InvalidMessageError("repeated stamp", "two poses have one stamp: a keyframe has one pose")
+    farthest = np.abs(map_from_camera[:, :3, 3]).max(initial=0.0)
+    if farthest > MAX_COORDINATE:
+        raise InvalidMessageError("poses", f"a pose {farthest:g} m from the origin: {MAX_COORDINATE:g} m at most")
+    return ReceivedPoses(stamp, stamps, map_from_camera)
+
+
+def sfm_status(message: SfmStatus) -> ReceivedStatus:
+    """Number and scale of the last map; a map has a scale with a standard deviation."""
+    stamp_and_frame(message.header)
+    stamp = checked_stamp(message.map_stamp)
+    if len(message.scale_source) > MAX_NAME:
+        raise InvalidMessageError("name", f"a scale_source of {len(message.scale_source)} characters is no source")
+    if message.map_revision and not 0.0 <= message.scale_sigma < np.inf:
+        raise InvalidMessageError("scale", f"scale_sigma is {message.scale_sigma:g}: a map has one, zero or larger")
+    return ReceivedStatus(stamp, message.map_revision, message.scale_source, message.scale_sigma)

@@ -57,6 +57,15 @@ def test_only_what_can_be_converted_is_used(node: FakeNode) -> None:
     assert intake.health() == {"dropped on numbers: invalid": 1, "dropped on numbers: sign": 2}
 
 
+def test_who_waits_for_a_message_is_told_that_it_was_dropped(node: FakeNode) -> None:
+    used: list[float] = []
+    dropped: list[int] = []
+    Intake(node).subscribe(int, "numbers", positive, used.append, QoSProfile(depth=1), dropped=dropped.append)
+    for value in (1, -2, 0):
+        node.callbacks["numbers"](value)
+    assert (used, dropped) == ([1.0], [-2, 0])
+
+
 def test_each_kind_is_said_once(node: FakeNode) -> None:
     intake = Intake(node)
     intake.subscribe(int, "numbers", positive, lambda value: None, QoSProfile(depth=1))
