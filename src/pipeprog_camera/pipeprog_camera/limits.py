@@ -32,7 +32,7 @@ MAX_QUATERNION_ERROR = 0.01  # of the norm: four components typed with two decim
 MAX_ACCELERATION = 1e4  # m/s^2; a thousand times gravity, beyond any accelerometer of a robot
 MAX_TRANSFORMS = 1000  # transforms of one TFMessage; a humanoid with two hands has a hundred joints
 MAX_TRANSFORM_FRAMES = 10_000  # names of frames from TF, odometry and IMU: a hundred robots of a hundred frames
-MAX_WAITING_MOTION = 200_000  # transforms or accelerations since the last keyframe; 100 s of a large TF tree, 60 MB
+MAX_WAITING_MOTION = 1_000_000  # transforms or accelerations since the last keyframe; 10 minutes of 1500 a second
 MAX_UNPAIRED = 50  # images without calibration, or the reverse: as deep as the keyframes' topic
 MAX_CAMERAS = 64  # keyframes of one moment: more cameras than any robot has
 

@@ -225,7 +225,7 @@ def _transform(
     parent, child = _frame(frame_id), _frame(child_frame_id)
     if not parent or not child or parent == child or len(child) > MAX_NAME:
         raise InvalidMessageError(
-            "name", f"a transform from '{parent[:MAX_NAME]}' to '{child[:MAX_NAME]}': two names of frames are needed"
+            "name", f"a transform from {parent!r} to {child[:MAX_NAME]!r}: two names of frames are needed"
         )
     return ReceivedTransform(stamp, parent, child, rigid_transform(position, orientation))
 

@@ -4,30 +4,43 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import Point, Quaternion, Vector3
 from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, PointCloud2
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import (
+    MAX_CAMERAS,
+    MAX_ENCODED_IMAGE,
+    MAX_TRANSFORM_FRAMES,
+    MAX_UNPAIRED,
+    MAX_WAITING_MOTION,
+)
 from pipeprog_msgs import msg, srv
-from pipeprog_node import messages, qos
+from pipeprog_node import messages, qos, received
 from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
+from pipeprog_node.received import (
+    ReceivedAcceleration,
+    ReceivedCamera,
+    ReceivedImage,
+    ReceivedRetirement,
+    ReceivedTransform,
+    ReceivedTransforms,
+)
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 from pipeprog_sfm.config import SfmConfig
@@ -49,69 +62,158 @@ from pipeprog_sfm.worker import (
     serve,
 )
 
+IMAGES, CALIBRATIONS, RETIRED = "keyframes/image/compressed", "keyframes/camera_info", "keyframes/retired"
 STATUS_PERIOD = 0.2  # s, at most, from a message of motion to the status that counts it
 MAX_MOTION = 1000  # messages of odometry, TF or IMU that wait for this process: a second and more of the fastest IMU
+
+_Key = tuple[int, str]  # stamp [ns] and frame of a camera
 
 
 class MotionInput:
     """Subscribes to what a robot tells about its motion; `considered` counts messages, TF's by their transforms.
 
+    A message that cannot be used counts, too: a replay waits for all of them.
     reliable: no message may be lost, as in a replay; live, drivers send best effort.
     """
 
-    def __init__(self, node: Node, reliable: bool) -> None:
+    def __init__(self, intake: Intake, reliable: bool) -> None:
         self.considered = 0
-        self._logger = node.get_logger()
-        self._transforms: list[Transform] = []  # since the last keyframe, as are the accelerations
-        self._accelerations: list[Acceleration] = []
+        self._intake = intake
+        # Since the last keyframe; static transforms by their child, since the newest counts.
+        self._moving: deque[Transform] = deque(maxlen=MAX_WAITING_MOTION)
+        self._static: dict[str, Transform] = {}
+        self._accelerations: deque[Acceleration] = deque(maxlen=MAX_WAITING_MOTION)
+        self._frames: set[str] = set()
         source = qos.reliable(MAX_MOTION) if reliable else qos.sensor(MAX_MOTION)
-        subscribe = partial(node.create_subscription, qos_overriding_options=qos.OVERRIDABLE)
-        subscribe(Odometry, "odometry", self._on_odometry, source)
-        subscribe(Imu, "imu", self._on_imu, source)
-        subscribe(TFMessage, "/tf", partial(self._on_transforms, static=False), source)
-        subscribe(TFMessage, "/tf_static", partial(self._on_transforms, static=True), qos.kept(MAX_MOTION))
+        kept = qos.kept(MAX_MOTION)
+
+        def odometry(message: Odometry) -> ReceivedTransform:
+            self.considered += 1
+            return received.odometry(message)
+
+        def imu(message: Imu) -> ReceivedAcceleration:
+            self.considered += 1
+            return received.imu(message)
+
+        def transforms(message: TFMessage) -> ReceivedTransforms:
+            self.considered += len(message.transforms)
+            return received.transforms(message)
+
+        intake.subscribe(Odometry, "odometry", odometry, self._on_odometry, source, qos.OVERRIDABLE)
+        intake.subscribe(Imu, "imu", imu, self._on_imu, source, qos.OVERRIDABLE)
+        for topic, profile in (("/tf", source), ("/tf_static", kept)):
+            use = partial(self._on_transforms, topic)
+            intake.subscribe(TFMessage, topic, transforms, use, profile, qos.OVERRIDABLE)
 
     def take(self) -> RobotMotion:
         """What has come since the last call."""
-        motion = RobotMotion(tuple(self._transforms), tuple(self._accelerations))
-        self._transforms, self._accelerations = [], []
+        motion = RobotMotion((*self._static.values(), *self._moving), tuple(self._accelerations))
+        self._static.clear()
+        self._moving.clear()
+        self._accelerations.clear()
         return motion
 
-    def _on_odometry(self, message: Odometry) -> None:
-        pose = message.pose.pose
-        self._add(message.header, message.child_frame_id, pose.position, pose.orientation, static=False)
+    def _on_odometry(self, pose: ReceivedTransform) -> None:
+        self._add("odometry", pose)
 
-    def _on_transforms(self, message: TFMessage, static: bool) -> None:
+    def _on_transforms(self, topic: str, message: ReceivedTransforms) -> None:
+        for error in message.refused:
+            self._intake.reject(topic, error)
         for transform in message.transforms:
-            edge = transform.transform
-            self._add(transform.header, transform.child_frame_id, edge.translation, edge.rotation, static)
+            self._add(topic, transform)
 
-    def _add(
-        self, header: Header, child: str, position: Point | Vector3, orientation: Quaternion, static: bool
-    ) -> None:
-        self.considered += 1
-        x, y, z = position.x, position.y, position.z
-        values = np.array([x, y, z, orientation.x, orientation.y, orientation.z, orientation.w])
-        if not header.frame_id or not child or not np.isfinite(values).all() or not values[3:].any():
-            self._logger.warning(
-                f"a transform from '{header.frame_id}' to '{child}' cannot be used: it wants both names and a rotation",
-                throttle_duration_sec=10.0,
-            )
+    def _add(self, topic: str, edge: ReceivedTransform) -> None:
+        if not self._knows(topic, edge.parent, edge.child):
             return
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
-        # tf2 takes names with and without the leading slash of ROS 1 for the same.
-        names = header.frame_id.lstrip("/"), child.lstrip("/")
-        self._transforms.append(Transform(messages.stamp_ns(header.stamp), *names, pose, static))
+        static = topic == "/tf_static"
+        transform = Transform(edge.stamp, edge.parent, edge.child, edge.parent_from_child, static)
+        if static:
+            self._static[edge.child] = transform
+        else:
+            self._moving.append(transform)
 
-    def _on_imu(self, message: Imu) -> None:
-        self.considered += 1
-        force = message.linear_acceleration
-        values = np.array([force.x, force.y, force.z])
-        # REP 145: -1 says that there are no accelerations.
-        if message.linear_acceleration_covariance[0] >= 0 and np.isfinite(values).all():
-            stamp = messages.stamp_ns(message.header.stamp)
-            self._accelerations.append(Acceleration(stamp, message.header.frame_id.lstrip("/"), values))
+    def _on_imu(self, felt: ReceivedAcceleration) -> None:
+        if felt.force is not None and self._knows("imu", felt.frame):
+            self._accelerations.append(Acceleration(felt.stamp, felt.frame, felt.force))
+
+    def _knows(self, topic: str, *frames: str) -> bool:
+        """Whether the frames are among the first MAX_TRANSFORM_FRAMES; says where not."""
+        if len(self._frames.union(frames)) > MAX_TRANSFORM_FRAMES:
+            text = f"more than {MAX_TRANSFORM_FRAMES} names of frames: {frames[-1]!r} and further ones are left out"
+            self._intake.reject(topic, InvalidMessageError("frames", text))
+            return False
+        self._frames.update(frames)
+        return True
+
+
+class KeyframeInput:
+    """Subscribes to keyframes: an image and its calibration are handed on once both have come.
+
+    Cameras of one body may be triggered together: a nanosecond tells their images apart.
+    """
+
+    def __init__(self, intake: Intake, use: Callable[[int, bytes, Camera, str], None]) -> None:
+        self._intake, self._use = intake, use
+        self._images: dict[_Key, bytes] = {}  # without calibration
+        self._cameras: dict[_Key, Camera] = {}  # without image
+        self._stamps: dict[_Key, int] = {}  # of the keyframes handed on: theirs alone
+        self._keys: dict[int, _Key] = {}  # the reverse
+        depth = qos.reliable(MAX_BACKLOG)
+        intake.subscribe(CompressedImage, IMAGES, received.compressed_image, self._on_image, depth)
+        intake.subscribe(CameraInfo, CALIBRATIONS, received.camera_info, self._on_camera, depth)
+
+    def frame_id(self, stamp: int) -> str:
+        """The frame of the camera of a keyframe that was handed on."""
+        return self._keys[stamp][1]
+
+    def forget(self, stamps: Iterable[int]) -> None:
+        """Keyframes of these stamps may come again."""
+        for stamp in stamps:
+            if stamp in self._keys:
+                del self._stamps[self._keys.pop(stamp)]
+
+    def _on_image(self, image: ReceivedImage) -> None:
+        key = image.stamp, image.frame_id
+        if self._is_new(key, IMAGES):
+            self._images[key] = image.encoded
+            self._pair(key)
+            while len(self._images) > 1 and (
+                len(self._images) > MAX_UNPAIRED or sum(map(len, self._images.values())) > MAX_ENCODED_IMAGE
+            ):
+                self._drop_oldest(self._images, IMAGES, "calibration")
+
+    def _on_camera(self, calibration: ReceivedCamera) -> None:
+        key = calibration.stamp, calibration.frame_id
+        if self._is_new(key, CALIBRATIONS):
+            self._cameras[key] = calibration.camera
+            self._pair(key)
+            if len(self._cameras) > MAX_UNPAIRED:
+                self._drop_oldest(self._cameras, CALIBRATIONS, "image")
+
+    def _is_new(self, key: _Key, topic: str) -> bool:
+        if key in self._stamps:
+            text = f"the keyframe of camera {key[1]!r} at {key[0]} ns came twice: is it published by two nodes?"
+            self._intake.reject(topic, InvalidMessageError("repeated", text))
+            return False
+        return True
+
+    def _drop_oldest(self, unpaired: dict[_Key, Any], topic: str, missing: str) -> None:
+        key = next(iter(unpaired))
+        del unpaired[key]
+        text = f"no {missing} of camera {key[1]!r} at {key[0]} ns has come: publish both with one stamp and frame_id"
+        self._intake.reject(topic, InvalidMessageError("unpaired", text))
+
+    def _pair(self, key: _Key) -> None:
+        if key not in self._images or key not in self._cameras:
+            return
+        image, camera = self._images.pop(key), self._cameras.pop(key)
+        stamp = next((stamp for stamp in range(key[0], key[0] + MAX_CAMERAS) if stamp not in self._keys), None)
+        if stamp is None:
+            text = f"{MAX_CAMERAS} keyframes at {key[0]} ns have come already: camera {key[1]!r} is left out"
+            self._intake.reject(IMAGES, InvalidMessageError("cameras", text))
+            return
+        self._stamps[key], self._keys[stamp] = stamp, key
+        self._use(stamp, image, camera, key[1])
 
 
 class MapOutput:
@@ -214,21 +316,18 @@ class SfmNode(Node):
         # A replay that loses its reconstruction ends; on the robot it is begun anew.
         self._supervisor = Supervisor(self._start_worker, None if lockstep else Journal())
         self._output = MapOutput(self)
-        self._motion = MotionInput(self, reliable=lockstep)
+        self._intake = Intake(self)
+        self._motion = MotionInput(self._intake, reliable=lockstep)
+        self._keyframes = KeyframeInput(self._intake, self._on_keyframe)
         self._status = Status()
         self._motion_published = 0  # messages of motion that the last status counts
-        self._images: dict[tuple[int, str], CompressedImage] = {}  # by stamp and frame, as the calibrations
-        self._cameras: dict[tuple[int, str], Camera] = {}
-        self._frame_ids: dict[int, str] = {}
-        self._retirements: deque[msg.KeyframesRetired] = deque()  # to be applied after the keyframes before them
-        self._retiring: deque[msg.KeyframesRetired] = deque()  # at the worker
+        self._retirements: list[ReceivedRetirement] = []  # to be applied after the keyframes before them
+        self._retiring: deque[ReceivedRetirement] = deque()  # at the worker
         self._seen = self._last_stamp = 0
         self._finish: tuple[int, Future] | None = None
         self._finish_sent = False
         depth = qos.reliable(MAX_BACKLOG)
-        self.create_subscription(CompressedImage, "keyframes/image/compressed", self._on_image, depth)
-        self.create_subscription(CameraInfo, "keyframes/camera_info", self._on_camera_info, depth)
-        self.create_subscription(msg.KeyframesRetired, "keyframes/retired", self._on_retired, depth)
+        self._intake.subscribe(msg.KeyframesRetired, RETIRED, received.retirement, self._on_retired, depth)
         # In a group of its own: while it waits for the end, the other callbacks must run.
         self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
@@ -241,46 +340,30 @@ class SfmNode(Node):
         self._supervisor.close()
         super().destroy_node()
 
-    def _on_image(self, message: CompressedImage) -> None:
-        stamp, frame_id = messages.stamp_ns(message.header.stamp), message.header.frame_id
-        self._images[stamp, frame_id] = message
-        self._pair(stamp, frame_id)
-
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        stamp, frame_id = messages.stamp_ns(message.header.stamp), message.header.frame_id
-        try:
-            self._cameras[stamp, frame_id] = messages.camera_from_info(message)
-        except InputError as error:
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return
-        self._pair(stamp, frame_id)
-
-    def _pair(self, stamp: int, frame_id: str) -> None:
-        """Hands a keyframe to the worker once image and calibration of one stamp have both come."""
-        if (stamp, frame_id) not in self._images or (stamp, frame_id) not in self._cameras:
-            return
-        image, camera = self._images.pop((stamp, frame_id)), self._cameras.pop((stamp, frame_id))
-        # Cameras of one body may be triggered together: a nanosecond tells their images apart.
-        while self._frame_ids.setdefault(stamp, frame_id) != frame_id:
-            stamp += 1
+    def _on_keyframe(self, stamp: int, encoded: bytes, camera: Camera, frame_id: str) -> None:
         self._seen += 1
         self._last_stamp = max(self._last_stamp, stamp)
         if self._supervisor.is_full:
             self._supervisor.dropped += 1
         else:
-            self._supervisor.send(AddKeyframe(stamp, bytes(image.data), camera, frame_id, self._motion.take()))
+            self._supervisor.send(AddKeyframe(stamp, encoded, camera, frame_id, self._motion.take()))
         self._retire_when_due()
         self._finish_when_complete()
 
-    def _on_retired(self, message: msg.KeyframesRetired) -> None:
-        self._retirements.append(message)
+    def _on_retired(self, retirement: ReceivedRetirement) -> None:
+        self._retirements.append(retirement)
         self._retire_when_due()
+        if len(self._retirements) > MAX_BACKLOG:
+            last = max(self._retirements, key=lambda each: each.keyframes_published)
+            self._retirements.remove(last)
+            text = f"{MAX_BACKLOG} retirements wait already, that after {last.keyframes_published} keyframes is dropped"
+            self._intake.reject(RETIRED, InvalidMessageError("waiting", text))
 
     def _retire_when_due(self) -> None:
-        while self._retirements and self._seen >= self._retirements[0].keyframes_published:
-            message = self._retirements.popleft()
-            self._retiring.append(message)
-            self._supervisor.send(Retire(tuple(messages.stamp_ns(stamp) for stamp in message.stamps)))
+        for retirement in [each for each in self._retirements if self._seen >= each.keyframes_published]:
+            self._retirements.remove(retirement)
+            self._retiring.append(retirement)
+            self._supervisor.send(Retire(retirement.stamps))
 
     async def _on_finish(self, request: srv.Finish.Request, response: srv.Finish.Response) -> srv.Finish.Response:
         done: Future = Future()
@@ -307,11 +390,13 @@ class SfmNode(Node):
             return
         self._status = event.status
         if isinstance(event, KeyframeDone):
-            self._publish_overlap(event, messages.header(event.stamp, self._frame_ids[event.stamp]))
+            self._publish_overlap(event, messages.header(event.stamp, self._keyframes.frame_id(event.stamp)))
             if event.trajectory is not None:
                 self._output.publish_poses(event.trajectory)
         elif isinstance(event, Retired):
-            self._publish_overlap(event, self._retiring.popleft().header)
+            retirement = self._retiring.popleft()
+            self._keyframes.forget(retirement.stamps)
+            self._publish_overlap(event, messages.header(retirement.stamp, retirement.frame_id))
         elif isinstance(event, MapReady):
             self._output.publish_map(event.map)
         self._publish_status()
@@ -341,9 +426,13 @@ class SfmNode(Node):
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         status, dropped = self._status, self._supervisor.dropped
         values: dict[str, Any] = {"keyframes": self._seen, "waiting": self._supervisor.backlog, "dropped": dropped}
-        values |= {"motion": self._motion.considered}
+        values |= {"motion": self._motion.considered} | self._intake.health()
+        refused = "messages that cannot be used were dropped: the values say of which kind" * bool(
+            self._intake.rejected
+        )
+        level = DiagnosticStatus.WARN if refused else DiagnosticStatus.OK
         if status == Status():
-            return DiagnosticStatus.OK, "waiting for keyframes" if self._supervisor.ready else "starting", values
+            return level, refused or ("waiting for keyframes" if self._supervisor.ready else "starting"), values
         values |= {
             "registered": status.registered,
             "models": status.models,
@@ -354,7 +443,7 @@ class SfmNode(Node):
         }
         if dropped or status.message:
             return DiagnosticStatus.WARN, status.message or "keyframes were dropped: the machine cannot keep up", values
-        return DiagnosticStatus.OK, "mapping", values
+        return level, refused or "mapping", values
 
 
 def main() -> None:
