@@ -33,6 +33,7 @@ GLUE = {
         "qos",
         "diagnostics",
         "discovery",
+        "finish",
         "intake",
         "messages",
         "main",

@@ -18,8 +18,7 @@ def encoded_size(encoded: bytes) -> tuple[int, int]:
     """(width, height) [px] of JPEG or PNG bytes; raises InputError for other bytes and sizes that are no picture's."""
     if not encoded:
         raise InputError("the image is empty (0 bytes)")
-    if len(encoded) > MAX_ENCODED_IMAGE:
-        raise InputError(f"the image has {len(encoded)} bytes: {MAX_ENCODED_IMAGE} at most are taken")
+    check_bytes(len(encoded))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_PIXELS is the limit
@@ -34,6 +33,12 @@ def encoded_size(encoded: bytes) -> tuple[int, int]:
     if scans > MAX_JPEG_SCANS:
         raise InputError(f"the JPEG has {scans} scans: {MAX_JPEG_SCANS} at most are decoded")
     return width, height
+
+
+def check_bytes(size: int) -> None:
+    """Raises InputError where an image has more bytes than any that can be used."""
+    if size > MAX_ENCODED_IMAGE:
+        raise InputError(f"the image has {size} bytes: {MAX_ENCODED_IMAGE} at most are taken")
 
 
 def check_size(width: int, height: int) -> None:

@@ -12,24 +12,25 @@ from geometry_msgs.msg import Point, Quaternion, Vector3
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.encoded_image import encoded_size
+from pipeprog_camera.encoded_image import check_bytes, check_size, encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import (
     MAX_ACCELERATION,
     MAX_COORDINATE,
     MAX_NAME,
     MAX_NORMAL_ERROR,
+    MAX_OVERLAP,
     MAX_POSES,
     MAX_QUATERNION_ERROR,
     MAX_SECONDS,
     MAX_TRANSFORMS,
 )
-from pipeprog_msgs.msg import KeyframesRetired, SfmStatus
+from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray, KeyframesRetired, SfmStatus
 from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
 
@@ -43,6 +44,15 @@ class ReceivedImage:
     encoded: bytes
     width: int
     height: int
+
+
+@dataclass(frozen=True)
+class ReceivedRawImage:
+    """An image as its sensor gives it: stamp [ns], frame of the camera, (H, W) grey or (H, W, 3) BGR pixels."""
+
+    stamp: int
+    frame_id: str
+    pixels: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -119,6 +129,28 @@ class ReceivedStatus:
     scale_sigma: float
 
 
+@dataclass(frozen=True)
+class ReceivedOverlap:
+    """Overlap of one keyframe; fields as in pipeprog_msgs/ImageOverlap, the stamp in ns."""
+
+    stamp: int
+    registered: bool
+    overlap: float
+    cell_overlap: float
+    matches_previous: int
+    matches_next: int
+
+
+@dataclass(frozen=True)
+class ReceivedOverlaps:
+    """One answer of the SfM: stamp [ns] of the newest keyframe it has considered, counts, overlaps that changed."""
+
+    stamp: int
+    keyframes: int
+    retirements: int
+    images: tuple[ReceivedOverlap, ...]
+
+
 def stamp_and_frame(header: Header) -> tuple[int, str]:
     """Stamp [ns], zero or later, and name of the frame."""
     if len(header.frame_id) > MAX_NAME:
@@ -144,6 +176,17 @@ def compressed_image(message: CompressedImage) -> ReceivedImage:
     except InputError as error:
         raise InvalidMessageError("image", str(error)) from None
     return ReceivedImage(stamp, frame_id, encoded, width, height)
+
+
+def raw_image(message: Image) -> ReceivedRawImage:
+    """An image whose size, encoding and bytes fit; its pixels are the message's own where none must be converted."""
+    stamp, frame_id = stamp_and_frame(message.header)
+    try:
+        check_size(message.width, message.height)
+        check_bytes(len(message.data))
+        return ReceivedRawImage(stamp, frame_id, messages.image_from_msg(message))
+    except InputError as error:
+        raise InvalidMessageError("image", str(error)) from None
 
 
 def camera_info(message: CameraInfo) -> ReceivedCamera:
@@ -202,6 +245,33 @@ def retirement(message: KeyframesRetired) -> ReceivedRetirement:
         )
     stamps = tuple(checked_stamp(each) for each in message.stamps)
     return ReceivedRetirement(stamp, frame_id, message.keyframes_published, stamps)
+
+
+def image_overlaps(message: ImageOverlapArray) -> ReceivedOverlaps:
+    """Overlaps from 0 to 1, of no more keyframes than a survey can reach."""
+    stamp, _ = stamp_and_frame(message.header)
+    counts = message.keyframes_considered, message.retirements_considered, len(message.images)
+    if max(counts) > MAX_POSES:
+        raise InvalidMessageError(
+            "count",
+            "an answer to {} keyframes and {} retirements with the overlaps of {}".format(*counts)
+            + f": {MAX_POSES} at most are taken",
+        )
+    return ReceivedOverlaps(stamp, *counts[:2], tuple(_overlap(image) for image in message.images))
+
+
+def _overlap(image: ImageOverlap) -> ReceivedOverlap:
+    for value in (image.overlap, image.cell_overlap):
+        if not 0.0 <= value <= MAX_OVERLAP:  # false for NaN
+            raise InvalidMessageError("overlap", f"an overlap of {value:g}: it is a share of the image, from 0 to 1")
+    return ReceivedOverlap(
+        checked_stamp(image.stamp),
+        image.registered,
+        image.overlap,
+        image.cell_overlap,
+        image.matches_previous,
+        image.matches_next,
+    )
 
 
 def rigid_transform(position: Point | Vector3, orientation: Quaternion) -> NDArray[np.float64]:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from sensor_msgs.msg import CameraInfo, RegionOfInterest
+from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 
 from pipeprog_camera.camera import Camera
+from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray
 from pipeprog_node import messages, received
 from pipeprog_node.intake import InvalidMessageError
 
@@ -92,3 +93,80 @@ def test_a_stamp_that_is_no_time_is_refused(stamp: Time) -> None:
     with pytest.raises(InvalidMessageError, match="stamp the message") as raised:
         received.camera_info(message)
     assert raised.value.kind == "stamp"
+
+
+GREY = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
+
+
+def raw(**changes: Any) -> Image:
+    message = Image(header=messages.header(17, "camera"), width=64, height=48, step=64, encoding="mono8")
+    message.data = GREY.tobytes()
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def test_a_raw_image_is_taken_without_a_copy() -> None:
+    message = raw()
+    image = received.raw_image(message)
+    assert (image.stamp, image.frame_id) == (17, "camera")
+    np.testing.assert_array_equal(image.pixels, GREY)
+    assert np.shares_memory(image.pixels, np.frombuffer(message.data, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"width": 0}, "too small"),
+        ({"width": 1, "height": 1}, "too small"),
+        ({"width": 100_000, "height": 100_000}, "too large"),
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "too large"),
+        ({"step": 63}, "rows of 63 bytes"),
+        ({"step": 2**32 - 1}, "damaged image"),
+        ({"data": []}, "are not 0 bytes"),
+        ({"encoding": "rgb8"}, "damaged image"),
+        ({"encoding": "yuv422" * 1000}, "publish one of"),
+    ],
+)
+def test_a_raw_image_whose_fields_do_not_fit_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidMessageError, match=words) as raised:
+        received.raw_image(raw(**changes))
+    assert raised.value.kind == "image"
+    assert len(str(raised.value)) < 300
+
+
+def overlaps(**changes: Any) -> ImageOverlapArray:
+    image = ImageOverlap(stamp=Time(sec=3), registered=True, overlap=0.5, cell_overlap=0.25)
+    for name, value in changes.items():
+        setattr(image, name, value)
+    return ImageOverlapArray(
+        header=messages.header(17, "camera"), keyframes_considered=4, retirements_considered=1, images=[image]
+    )
+
+
+def test_overlaps_are_taken_as_they_are() -> None:
+    image = received.ReceivedOverlap(3_000_000_000, True, 0.5, 0.25, 0, 0)
+    assert received.image_overlaps(overlaps()) == received.ReceivedOverlaps(17, 4, 1, (image,))
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind"),
+    [
+        ({"overlap": float("nan")}, "overlap"),
+        ({"overlap": float("inf")}, "overlap"),
+        ({"cell_overlap": -0.1}, "overlap"),
+        ({"cell_overlap": 1.1}, "overlap"),
+        ({"stamp": Time(sec=-1)}, "stamp"),
+    ],
+)
+def test_overlaps_that_are_no_shares_are_refused(changes: dict[str, Any], kind: str) -> None:
+    with pytest.raises(InvalidMessageError) as raised:
+        received.image_overlaps(overlaps(**changes))
+    assert raised.value.kind == kind
+
+
+def test_more_answers_than_a_survey_has_keyframes_are_refused() -> None:
+    message = overlaps()
+    message.keyframes_considered = 2**32 - 1
+    with pytest.raises(InvalidMessageError, match="answer to 4294967295 keyframes"):
+        received.image_overlaps(message)
