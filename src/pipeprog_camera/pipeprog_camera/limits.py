@@ -40,3 +40,12 @@ MAX_CAMERAS = 64  # keyframes of one moment: more cameras than any robot has
 # Texts and times.
 MAX_NAME = 256  # characters of a frame or class name; ROS 2 limits topic names to as many
 MAX_SECONDS = 2**31 - 1  # s; builtin_interfaces/Time has 32 bits with a sign
+
+# Files of text.
+MAX_YAML = 1 << 20  # bytes; bills and boards have kilobytes, and libyaml reads a megabyte in under 2 s
+MAX_METADATA = 1 << 22  # bytes of a rosbag2 metadata.yaml; 10 000 files of a split recording take 1.5 MB
+MAX_JSON = 40 << 20  # bytes; MAX_POSES of a truth.json take 32 MB; of empty lists alone, it takes 1 GB in memory
+MAX_DEPTH = 32  # collections within each other; rosbag2 has 8 (QoS of a topic), the other files 5
+MAX_NODES = 1_000_000  # values of a YAML file after its aliases are followed; MAX_METADATA can hold as many, bare
+MAX_TEXT = 1 << 16  # characters of one text in YAML; rosbag2 writes the QoS of 100 publishers as one text of 40 000
+MAX_DIGITS = 100  # characters of one number; a double is exact in 24, and Python's int ends at 4300

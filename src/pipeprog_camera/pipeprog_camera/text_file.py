@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A file of text from outside, read whole: a regular file of bounded size in UTF-8."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from pipeprog_camera.errors import InputError
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a pipe between processes",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+def read_text(path: str | Path, most: int) -> str:
+    """The text of a regular file of at most `most` bytes, without its byte order mark.
+
+    Raises InputError, naming the file and the remedy, for what is no such file; a device or pipe is never opened.
+    """
+    data = _read(path, most)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path}, line {line}: the byte 0x{data[error.start]:02x} is no text in UTF-8: save the file as UTF-8"
+        ) from None
+
+
+def require_regular(path: str | Path) -> None:
+    """Raises InputError where there is no regular file (or a link to one)."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise InputError(f"no such file: {path}") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except ValueError:  # NUL, which no path has
+        raise InputError(f"{str(path)!r} cannot be read: it is no path") from None
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path} is {_KINDS.get(stat.S_IFMT(mode), 'something else')}: give a regular file")
+
+
+def _read(path: str | Path, most: int) -> bytes:
+    require_regular(path)
+    try:
+        # Should a pipe take the file's place in this moment, opening it does not wait for a writer.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
+            data = file.read(most + 1)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}): check the path and its permissions") from None
+    if len(data) > most:
+        raise InputError(f"{path} is larger than {most / 2**20:g} MiB, which no such file is: check the path")
+    return data
