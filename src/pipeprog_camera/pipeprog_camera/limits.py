@@ -49,3 +49,16 @@ MAX_DEPTH = 32  # collections within each other; rosbag2 has 8 (QoS of a topic),
 MAX_NODES = 1_000_000  # values of a YAML file after its aliases are followed; MAX_METADATA can hold as many, bare
 MAX_TEXT = 1 << 16  # characters of one text in YAML; rosbag2 writes the QoS of 100 publishers as one text of 40 000
 MAX_DIGITS = 100  # characters of one number; a double is exact in 24, and Python's int ends at 4300
+
+# Recordings. What a file may make of itself is in proportion to its size: real content does not grow a hundredfold.
+MAX_CHUNK = MAX_ENCODED_IMAGE + (1 << 20)  # bytes of a chunk or message, inflated: one image of the largest size
+MAX_INFLATION = 100  # times the file's size that its chunks may inflate to; images do 1 to 10, generated ones 50
+FREE_CONTENT = 1 << 30  # bytes that they may inflate to whatever the file's size: a second of work; one black image
+MAX_WAITING = 1 << 29  # bytes of messages held to sort them by time; chunks of usual size overlap by a few MB
+MIN_BYTES_OF_A_RECORD = 16  # bytes in the file, compressed, of one record on the average: a tenth of an IMU's message
+FREE_RECORDS = 1 << 20  # records that a file may hold whatever its size; a second of work
+MAX_DESCRIPTION = 1 << 20  # bytes of a schema or channel record; the largest of ROS 2 has 60 kB
+MAX_CHANNELS = 4096  # topics of one file; a large robot has some hundred
+MAX_BAG_PARTS = 10_000  # files of one folder; a week of files of one minute
+MAX_SMALL_MESSAGE = 1 << 20  # bytes of CameraInfo, Odometry, IMU or TF; a thousand transforms have 100 kB
+MAX_TRIED_IMAGES = 300  # images in which the first usable one is sought: ten seconds of video

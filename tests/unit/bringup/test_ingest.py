@@ -13,6 +13,7 @@ import yaml
 from pipeprog_bringup.ingest import START, Ingested, ingest, read_camera
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 
 FRAMES = 12
@@ -51,6 +52,10 @@ def calibration(path: Path, width: int = 160, height: int = 96, **changes: objec
     return path
 
 
+def frame_size(data: bytes) -> tuple[int, int]:
+    return encoded_size(bytes(cdr.read_image(data, cdr.COMPRESSED_IMAGE).data))
+
+
 def run(folder: Path, source: Path, camera: Path, force: bool = False) -> Ingested:
     return ingest(source, camera, folder / "bag.mcap", 95, force, lambda share, text: None)
 
@@ -63,7 +68,7 @@ def test_a_video_becomes_a_recording(tmp_path: Path) -> None:
     assert bag.camera.distortion == (0.1, -0.05, 0, 0, 0)
     np.testing.assert_allclose([frame.stamp for frame in frames], START + 40_000_000 * np.arange(FRAMES), atol=1e5)
     assert ingested.notes == []
-    assert cdr.image_size(frames[0].data, bag.image_type) == (160, 96)
+    assert frame_size(frames[0].data) == (160, 96)
 
 
 def test_a_calibration_of_another_size_is_scaled_where_the_aspect_fits(tmp_path: Path) -> None:
@@ -79,10 +84,10 @@ def test_a_turned_video_is_taken_as_the_calibration_has_it(tmp_path: Path) -> No
     turn(video(tmp_path / "v.mp4"))
     run(tmp_path, tmp_path / "v.mp4", calibration(tmp_path / "sensor.yaml"))
     bag = Bag.open(tmp_path / "bag.mcap")
-    assert cdr.image_size(next(iter(bag)).data, bag.image_type) == (160, 96)
+    assert frame_size(next(iter(bag)).data) == (160, 96)
     run(tmp_path, tmp_path / "v.mp4", calibration(tmp_path / "upright.yaml", 96, 160), force=True)
     bag = Bag.open(tmp_path / "bag.mcap")
-    assert cdr.image_size(next(iter(bag)).data, bag.image_type) == (96, 160)
+    assert frame_size(next(iter(bag)).data) == (96, 160)
 
 
 def test_a_recording_is_not_replaced_without_force(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 from pipeprog_bringup.results.result_files import FrameRow
 
-FAULTS = ("damaged", "stamp")  # beginnings of reasons that are faults of the recording itself
+# Beginnings of reasons that are faults of the recording itself.
+FAULTS = ("damaged", "stamp", "size", "calibration")
 
 
 class FrameLog:
@@ -19,6 +20,7 @@ class FrameLog:
         self._pending: defaultdict[int, deque[int]] = defaultdict(deque)
         self._first: dict[int, int] = {}
         self._overlap: dict[int, tuple[float, float, int, bool]] = {}
+        self._motion_lost: Counter[str] = Counter()
 
     @property
     def in_flight(self) -> int:
@@ -44,6 +46,10 @@ class FrameLog:
     def skip(self, stamp: int, reason: str) -> None:
         """A frame was not sent, for this reason."""
         self._rows.append(FrameRow(stamp, False, reason))
+
+    def skip_motion(self, topic: str) -> None:
+        """A message of motion was not sent: it is damaged."""
+        self._motion_lost[topic] += 1
 
     def decide(self, row: FrameRow) -> None:
         """A decision came; a second one about the same frame replaces the first."""
@@ -75,14 +81,29 @@ class FrameLog:
 
     def common_reasons(self) -> str:
         """The reasons most frequent among the frames that were not chosen, for an error's text."""
-        return "; ".join(f"{count} x {reason}" for reason, count in self._reasons().most_common(3))
+        groups = sorted(self._reasons().values(), key=len, reverse=True)[:3]
+        return "; ".join(f"{len(group)} x {self._reason(group[0])}" for group in groups)
 
     def faults(self) -> list[str]:
-        """The faults of the recording's frames, one sentence each."""
-        reasons = self._reasons()
-        return [
-            f"{reasons[reason]} frames left out: {reason}" for reason in sorted(reasons) if reason.startswith(FAULTS)
-        ]
+        """The faults of the recording's frames and of its motion, one sentence each."""
+        groups = sorted((kind, group) for kind, group in self._reasons().items() if kind.startswith(FAULTS))
+        frames = [f"{len(group)} frames left out: {self._named(group[0])}" for _, group in groups]
+        motion = sorted(self._motion_lost.items())
+        return frames + [f"{count} messages of {topic} left out: damaged" for topic, count in motion]
 
-    def _reasons(self) -> Counter[str]:
-        return Counter(row.reason for row in self._rows if row is not None and not row.chosen)
+    def _reasons(self) -> dict[str, list[int]]:
+        """The frames that were not chosen, by what their reasons begin with: the rest differs from frame to frame."""
+        groups: defaultdict[str, list[int]] = defaultdict(list)
+        for number, row in enumerate(self._rows):
+            if row is not None and not row.chosen:
+                groups[row.reason.partition(": ")[0]].append(number)
+        return groups
+
+    def _reason(self, number: int) -> str:
+        row = self._rows[number]
+        return row.reason if row is not None else ""
+
+    def _named(self, number: int) -> str:
+        """The reason of a frame, and which one it is, where the reason tells more than its kind."""
+        reason = self._reason(number)
+        return f"{reason} (frame {number + 1}, the first of them)" if ": " in reason else reason

@@ -16,12 +16,14 @@ from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import TF, TF_STATIC, Bag, ImageMessage, MotionMessage
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_SMALL_MESSAGE
 from pipeprog_node import messages, qos
 
 IN_FLIGHT = (
     8  # frames sent and not decided on, at most; more than frames.window (6 at most), or the selector would wait
 )
 KEPT = 1000  # messages of motion, ten times what is ever on its way (MOTION_IN_FLIGHT)
+MAX_GAP = 60.0  # s of the recording between two frames that a rate is held for; a stamp may be years off
 MOTION_IN_FLIGHT = 100  # messages of motion between two waits for the SfM to have them
 IMAGE_TYPES = {cdr.COMPRESSED_IMAGE: (CompressedImage, "image/compressed"), cdr.IMAGE: (Image, "image")}
 MOTION_TYPES = {"odometry": Odometry, "imu": Imu, TF: TFMessage, TF_STATIC: TFMessage}
@@ -52,19 +54,21 @@ class Player:
         where all images are damaged.
         """
         played = 0
-        begun, first = time.monotonic(), None
+        due, previous = time.monotonic(), None
         for message in self._bag.with_motion():
             if isinstance(message, MotionMessage):
                 self._send_motion(message)
                 continue
-            first = message.stamp if first is None else first
-            if not cdr.is_whole(message.data, self._bag.image_type):
-                self._log.skip(message.stamp, "damaged message")
+            if message.fault:
+                self._log.skip(message.stamp, message.fault)
                 continue
             while self._log.in_flight >= IN_FLIGHT:
                 spin(0.1)
             if rate is not None:
-                pause(begun + (message.stamp - first) * 1e-9 / rate)
+                gap = 0 if previous is None else message.stamp - previous
+                due += min(max(gap * 1e-9, 0.0), MAX_GAP) / rate
+                pause(due)
+            previous = message.stamp
             self._send_image(message)
             played += 1
             spin(0.0)
@@ -80,9 +84,13 @@ class Player:
     def _send_motion(self, message: MotionMessage) -> None:
         """Pass a message of motion on; a damaged one is left out."""
         publisher = self._motion[message.topic]
+        if len(message.data) > MAX_SMALL_MESSAGE:  # what it claims to hold would be allocated first
+            self._log.skip_motion(message.topic)
+            return
         try:
             content = deserialize_message(message.data, publisher.msg_type)
         except Exception:  # rclpy raises whatever its type support makes of the bytes
+            self._log.skip_motion(message.topic)
             return
         publisher.publish(content)
         self.motion_sent += len(content.transforms) if isinstance(content, TFMessage) else 1

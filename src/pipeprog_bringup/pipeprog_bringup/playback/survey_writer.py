@@ -59,7 +59,7 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
     """Write the keyframes into out.mcap, each with the calibration that was sent with it."""
     chosen = {row.stamp for row in log.rows() if row.chosen}
     for frame in bag:
-        if frame.stamp not in chosen or not cdr.is_whole(frame.data, bag.image_type):
+        if frame.stamp not in chosen or frame.fault:
             continue
         chosen.remove(frame.stamp)
         data = frame.data

@@ -6,29 +6,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
-import yaml
-
 from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording.bag_folder import parts
+from pipeprog_bringup.recording.frame_check import Calibration, FrameCheck, ImageMessage
 from pipeprog_bringup.recording.mcap_file import McapFile, Message
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_TRIED_IMAGES
 
 _IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
 TF, TF_STATIC = "/tf", "/tf_static"
 # Depth and disparity images have the same message types as pictures; no camera's picture has these encodings.
+_USED_TYPES = {*_IMAGE_TYPES, cdr.CAMERA_INFO, cdr.ODOMETRY, cdr.IMU, cdr.TF}
+_LISTED = 20  # topics that an error names
 _DEPTH_ENCODINGS = ("16UC1", "32FC1", "32FC2")
-
-
-@dataclass(frozen=True)
-class ImageMessage:
-    """One image of a recording: header stamp [ns], frame, serialised message, and the calibration in force."""
-
-    stamp: int
-    frame_id: str
-    data: bytes
-    camera_info: bytes
 
 
 @dataclass(frozen=True)
@@ -54,7 +48,8 @@ class Bag:
     notes: list[str]  # one sentence for each kind of motion that is not used, and why
     _motion_types: dict[str, str]
     _files: tuple[McapFile, ...]
-    _first_info: bytes
+    _first_calibration: Calibration
+    _left_out: Counter[str]  # messages of the last pass that are damaged, by topic
 
     @classmethod
     def open(
@@ -70,11 +65,11 @@ class Bag:
         Topics that are not given are found by their types. Raises InputError where the recording cannot be read, holds
         no calibrated camera or several, or where image and CameraInfo differ in size.
         """
-        files = tuple(McapFile.open(part) for part in _parts(path))
+        files = tuple(McapFile.open(part) for part in parts(path))
         counts, types = _topics(files, path)
         image_topic, info_topic = _choose(path, files, counts, types, image_topic, camera_info_topic)
         infos = (message.data for message in _messages(files, {info_topic}))
-        first_info, camera = _first_camera(path, info_topic, infos)
+        first_calibration, camera = _first_camera(path, info_topic, infos)
         motion, notes = _choose_motion(path, types, odometry_topic, imu_topic)
         motion_types = {topic: types[topic] for topic in motion}
         bag = cls(
@@ -88,9 +83,10 @@ class Bag:
             notes,
             motion_types,
             files,
-            first_info,
+            first_calibration,
+            Counter(),
         )
-        bag._check_size()
+        bag._check_images()
         return bag
 
     def __iter__(self) -> Iterator[ImageMessage]:
@@ -106,76 +102,32 @@ class Bag:
         yield from self._stream({topic for topic, target in self.motion_topics.items() if target != TF_STATIC})
 
     def _stream(self, motion: set[str]) -> Iterator[ImageMessage | MotionMessage]:
-        latest: dict[str, bytes] = {}
-        newest = self._first_info
+        check = FrameCheck(self.image_type, self.camera_info_topic, self._first_calibration)
         for topic, message in _tagged(self._files, {self.image_topic, self.camera_info_topic, *motion}):
             if topic in motion:
                 yield MotionMessage(self.motion_topics[topic], self._motion_types[topic], message.data)
-                continue
-            try:
-                stamp, frame_id = cdr.read_header(message.data)
-                if topic == self.camera_info_topic:
-                    cdr.read_camera_info(message.data)
-            except ValueError:
-                if topic == self.image_topic:
-                    yield ImageMessage(message.log_time, "", message.data, newest)
-                continue
-            if topic == self.camera_info_topic:
-                newest = latest[frame_id] = message.data
+            elif topic == self.camera_info_topic:
+                check.calibrate(message.data)
+                self._left_out[topic] = check.damaged
             else:
-                yield ImageMessage(stamp, frame_id, message.data, latest.get(frame_id, newest))
+                yield check.image(message.data, message.log_time)
 
     @property
     def losses(self) -> list[str]:
         """The parts of the recording that cannot be read, one sentence each; complete once it was read to its end."""
-        return [note for file in self._files for note in file.losses()]
+        damaged = [f"{count} messages on {topic} left out: damaged" for topic, count in self._left_out.items() if count]
+        return [note for file in self._files for note in file.losses()] + damaged
 
-    def _check_size(self) -> None:
-        """Compare the first image that can be decoded with the CameraInfo."""
-        for frame in self:
-            size = cdr.image_size(frame.data, self.image_type)
-            if size is None:
-                continue
-            if size != (self.camera.width, self.camera.height):
-                raise InputError(
-                    f"{self.path}: images on {self.image_topic} are {size[0]} x {size[1]}, but "
-                    f"{self.camera_info_topic} is calibrated for {self.camera.width} x {self.camera.height}: "
-                    "record the CameraInfo of this camera mode"
-                )
-            return
-        raise InputError(f"{self.path}: none of the {self.image_count} images on {self.image_topic} can be decoded")
-
-
-def _parts(path: Path) -> list[Path]:
-    """The mcap files of a recording, in order."""
-    if not path.exists():
-        raise InputError(f"no such bag: {path}")
-    if not path.is_dir():
-        return [path]
-    metadata = path / "metadata.yaml"
-    if not metadata.is_file():
-        inside = sorted(file.name for file in path.glob("*.mcap"))
-        remedy = f"give one of its files ({', '.join(inside)}) or run" if inside else "give a rosbag2 folder, or run"
-        raise InputError(f"{path} has no metadata.yaml: {remedy} `ros2 bag reindex {path}`")
-    try:
-        information = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
-        names = [str(name) for name in information["relative_file_paths"]]
-        storage = information.get("storage_identifier", "mcap")
-        mode = str(information.get("compression_mode", "")).upper()
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-        raise InputError(f"{metadata} is no rosbag2 metadata ({error}): run `ros2 bag reindex {path}`") from None
-    if storage != "mcap":
-        raise InputError(f"{path} is stored as {storage}: convert it with `ros2 bag convert` (storage_id: mcap)")
-    if mode == "FILE":
-        raise InputError(f"{path} is compressed file by file: decompress it with `ros2 bag convert`")
-    if not names:
-        raise InputError(f"{metadata} names no file: the recording is empty")
-    # Before Foxy the names were relative to the folder above.
-    parts = [path / name if (path / name).exists() else path / Path(name).name for name in names]
-    missing = [part.name for part in parts if not part.is_file()]
-    if missing:
-        raise InputError(f"{path}: {', '.join(missing)} named in metadata.yaml is missing: copy the folder again")
-    return parts
+    def _check_images(self) -> None:
+        """Raises InputError where none of the first images can be used; its text has their most frequent fault."""
+        faults: Counter[str] = Counter()
+        for frame in islice(self, MAX_TRIED_IMAGES):
+            if not frame.fault:
+                return
+            faults[frame.fault] += 1
+        tried = f"first {MAX_TRIED_IMAGES}" if faults.total() == MAX_TRIED_IMAGES else str(self.image_count)
+        fault = faults.most_common(1)[0][0] if faults else "their chunks are damaged"
+        raise InputError(f"{self.path}: none of the {tried} images on {self.image_topic} can be used: {fault}")
 
 
 def _topics(files: tuple[McapFile, ...], path: Path) -> tuple[Counter[str], dict[str, str]]:
@@ -189,7 +141,12 @@ def _topics(files: tuple[McapFile, ...], path: Path) -> tuple[Counter[str], dict
             if channel.encoding == "ros1":
                 raise InputError(f"{file.path} is a ROS 1 recording: convert it to ROS 2 (message encoding cdr)")
             counts[channel.topic] += file.counts[channel_id]
-            types[channel.topic] = channel.type_name
+            known = types.setdefault(channel.topic, channel.type_name)
+            if known != channel.type_name and {known, channel.type_name} & _USED_TYPES:
+                raise InputError(
+                    f"{file.path}: {channel.topic} has messages of two types, {known} and {channel.type_name}: "
+                    "record it again under two names"
+                )
     if not counts:
         notes = "; ".join(note for file in files for note in file.losses())
         raise InputError(f"{path} holds no messages" + (f" ({notes})" if notes else ": record it again"))
@@ -209,9 +166,7 @@ def _choose(
     images = sorted(topic for topic, name in types.items() if name in _IMAGE_TYPES)
     for flag, topic, known in (("--image-topic", image_topic, images), ("--camera-info-topic", info_topic, infos)):
         if topic is not None and topic not in known:
-            raise InputError(
-                f"{path}: {flag} {topic} is not among its topics: {', '.join(known) or 'none of that type'}"
-            )
+            raise InputError(f"{path}: {flag} {topic} is not among its topics: {_listed(known) or 'none of that type'}")
     cameras = [topic for topic in images if not _is_depth(files, topic, types[topic])]
     if image_topic is None:
         # The same picture is often recorded raw and compressed; frames passes keyframes on compressed in any case.
@@ -224,11 +179,11 @@ def _choose(
     else:
         cameras = [image_topic]
     if not cameras:
-        kinds = ", ".join(f"{topic} ({name})" for topic, name in sorted(types.items()))
+        kinds = _listed([f"{topic} ({name or 'no type'})" for topic, name in sorted(types.items())])
         raise InputError(f"{path} holds no images (sensor_msgs Image or CompressedImage): its topics are {kinds}")
     if not infos:
         raise InputError(
-            f"{path} holds images on {', '.join(cameras)} but no sensor_msgs/CameraInfo: record that topic too"
+            f"{path} holds images on {_listed(cameras)} but no sensor_msgs/CameraInfo: record that topic too"
         )
     if len(cameras) == 1:
         if info_topic is not None:
@@ -242,7 +197,8 @@ def _choose(
         for camera in cameras
         for info in ([_sibling_info(camera)] if _sibling_info(camera) in infos else infos)
     ]
-    raise InputError(f"{path} holds several cameras: choose one with\n" + "\n".join(choices))
+    more = [f"  and {len(choices) - _LISTED} more"] if len(choices) > _LISTED else []
+    raise InputError(f"{path} holds several cameras: choose one with\n" + "\n".join(choices[:_LISTED] + more))
 
 
 def _choose_motion(
@@ -258,16 +214,21 @@ def _choose_motion(
         known = sorted(topic for topic, name in types.items() if name == type_name)
         if wanted is not None and wanted not in known:
             raise InputError(
-                f"{path}: {flag} {wanted} is not among its topics: {', '.join(known) or 'none of that type'}"
+                f"{path}: {flag} {wanted} is not among its topics: {_listed(known) or 'none of that type'}"
             )
         if wanted is not None or len(known) == 1:
             chosen[wanted or known[0]] = target
         elif known:
             notes.append(
                 f"{path} holds several topics of {type_name}, and none is used: choose one with "
-                + " or ".join(f"{flag} {topic}" for topic in known)
+                + " or ".join(f"{flag} {topic}" for topic in known[:_LISTED])
             )
     return chosen, notes
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
 
 
 def _sibling_info(image_topic: str) -> str:
@@ -278,19 +239,22 @@ def _sibling_info(image_topic: str) -> str:
 
 def _is_depth(files: tuple[McapFile, ...], topic: str, type_name: str) -> bool:
     first = next(_messages(files, {topic}), None)
-    encoding = cdr.image_encoding(first.data, type_name) if first else ""
+    try:
+        encoding = cdr.read_image(first.data, type_name).encoding if first else ""
+    except ValueError:
+        return False
     return encoding.startswith(_DEPTH_ENCODINGS) or "compressedDepth" in encoding
 
 
-def _first_camera(path: Path, topic: str, infos: Iterator[bytes]) -> tuple[bytes, Camera]:
+def _first_camera(path: Path, topic: str, infos: Iterator[bytes]) -> tuple[Calibration, Camera]:
     """The first CameraInfo that can be read, and its camera."""
     for data in infos:
         try:
-            info = cdr.read_camera_info(data)
+            calibration, info = Calibration.read(data), cdr.read_camera_info(data)
         except ValueError:
             continue
         try:
-            return data, info.camera()
+            return calibration, info.camera()
         except InputError as error:
             raise InputError(f"{path}: {topic}: {error}") from None
     raise InputError(f"{path}: no message on {topic} can be read: record it again")

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera's messages as CDR bytes, without rclpy: read by hand, written by mcap_ros2.
 
-Reading needs the first fields only (a stamp, a size), must survive damaged messages, and recordings may lack the
-definitions that a general decoder needs. Layout: OMG CDR (XCDR1), a four-byte encapsulation header, every number
-aligned to its size counted from behind that header; the definitions are those of sensor_msgs in ROS 2 Jazzy.
+Reading must survive damaged messages, and recordings may lack the definitions that a general decoder needs. A message
+is read to its end, since the middleware drops without a word what it cannot decode. Layout: OMG CDR (XCDR1), a
+four-byte encapsulation header, every number aligned to its size counted from behind that header; the definitions are
+those of sensor_msgs in ROS 2 Jazzy.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy as np
 from mcap_ros2.writer import serialize_dynamic
 
 from pipeprog_bringup.recording.definitions import message_definition
-from pipeprog_camera.camera import Camera
+from pipeprog_camera.camera import Camera, check_whole_sensor
+from pipeprog_camera.limits import MAX_DISTORTION_COEFFICIENTS, MAX_NAME, MAX_SMALL_MESSAGE
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -29,122 +31,129 @@ TF = "tf2_msgs/msg/TFMessage"
 NANOSECONDS = 1_000_000_000
 
 
+_LITTLE_ENDIAN, _BIG_ENDIAN = b"\0\1", b"\0\0"  # encapsulation identifiers of plain CDR
+
+
+class StampError(ValueError):
+    """A stamp that is no time."""
+
+
 @dataclass(frozen=True)
 class CameraInfo:
-    """A CameraInfo message: size [px], row-major (9,) K, distortion in the model's order."""
+    """A CameraInfo message: size [px], row-major (9,) K, distortion in the model's order, part of the sensor.
 
-    stamp: int
+    `binning`, `offset` and `region` are (x, y) in pixels, as in camera.check_whole_sensor.
+    """
+
     frame_id: str
     width: int
     height: int
     distortion_model: str
     distortion: tuple[float, ...]
     k: tuple[float, ...]
+    binning: tuple[int, int]
+    offset: tuple[int, int]
+    region: tuple[int, int]
 
     def camera(self) -> Camera:
         """The camera that it describes; raises InputError where it is not calibrated or its model is unknown."""
+        check_whole_sensor((self.width, self.height), self.binning, self.offset, self.region)
         return Camera.from_calibration(self.width, self.height, self.k, self.distortion_model, self.distortion)
 
 
+@dataclass(frozen=True)
+class ImageFields:
+    """An image message: stamp [ns], frame, the format of a compressed image or the encoding of a raw one, its bytes.
+
+    `width`, `height` [px] and `step` [bytes of a row] are those of a raw image, 0 of a compressed one.
+    """
+
+    stamp: int
+    frame_id: str
+    encoding: str
+    data: memoryview
+    width: int = 0
+    height: int = 0
+    step: int = 0
+
+
 class _Reader:
-    """Reads one message; struct.error or IndexError where the bytes end too early."""
+    """Reads one message; ValueError where the bytes end too early or are none of a message."""
 
     def __init__(self, data: bytes) -> None:
-        if len(data) < 4:
-            raise struct.error("no encapsulation header")
+        if data[:2] not in (_LITTLE_ENDIAN, _BIG_ENDIAN) or len(data) < 4:
+            raise ValueError("no encapsulation header of CDR")
         self.data = data
         self.position = 4
-        self.order = "<" if data[1] & 1 else ">"
+        self.order = "<" if data[:2] == _LITTLE_ENDIAN else ">"
 
     def numbers(self, kind: str, count: int) -> tuple:
         size = struct.calcsize(kind)
         start = self.position + (4 - self.position) % size
         self.position = start + size * count
+        if self.position > len(self.data):
+            raise ValueError(f"cut off: {len(self.data)} bytes")
         return struct.unpack_from(f"{self.order}{count}{kind}", self.data, start)
 
     def number(self, kind: str) -> int:
         return self.numbers(kind, 1)[0]
 
-    def string(self) -> str:
+    def bytes(self) -> memoryview:
+        """A sequence of octets, with its length before it; a view."""
         length = self.number("I")
-        text = self.data[self.position : self.position + length]
-        if len(text) < length:
-            raise struct.error("string cut off")
+        content = memoryview(self.data)[self.position : self.position + length]
+        if len(content) < length:
+            raise ValueError(f"cut off: {len(content)} of {length} bytes")
         self.position += length
-        return text.rstrip(b"\0").decode("utf-8", "replace")
+        return content
+
+    def string(self) -> str:
+        text = bytes(self.bytes()).rstrip(b"\0").decode("utf-8", "replace")
+        if len(text) > MAX_NAME or not text.isprintable():
+            raise ValueError(f"{len(text)} characters that are no name")
+        return text
 
     def header(self) -> tuple[int, str]:
         seconds, nanoseconds = self.number("i"), self.number("I")
+        if seconds < 0 or nanoseconds >= NANOSECONDS:
+            raise StampError(f"stamp is no time: {seconds} s + {nanoseconds} ns; the camera's driver must set it")
         return seconds * NANOSECONDS + nanoseconds, self.string()
 
 
-def read_header(data: bytes) -> tuple[int, str]:
-    """Stamp [ns] and frame of any message that begins with a std_msgs/Header; ValueError where it is damaged."""
-    try:
-        return _Reader(data).header()
-    except (struct.error, IndexError) as error:
-        raise ValueError(f"damaged message header: {error}") from None
-
-
 def read_camera_info(data: bytes) -> CameraInfo:
-    """A CameraInfo from its CDR bytes; ValueError where they are damaged."""
-    try:
-        reader = _Reader(data)
-        stamp, frame_id = reader.header()
-        height, width = reader.numbers("I", 2)
-        model = reader.string()
-        distortion = reader.numbers("d", reader.number("I"))
-        return CameraInfo(stamp, frame_id, width, height, model, distortion, reader.numbers("d", 9))
-    except (struct.error, IndexError, MemoryError) as error:
-        raise ValueError(f"damaged CameraInfo: {error}") from None
+    """A CameraInfo from its CDR bytes, read to its end; ValueError where they are damaged."""
+    if len(data) > MAX_SMALL_MESSAGE:
+        raise ValueError(f"{len(data)} bytes are no CameraInfo")
+    reader = _Reader(data)
+    _, frame_id = reader.header()
+    height, width = reader.numbers("I", 2)
+    model = reader.string()
+    coefficients = reader.number("I")
+    if coefficients > MAX_DISTORTION_COEFFICIENTS:
+        raise ValueError(f"{coefficients} distortion coefficients")
+    distortion = reader.numbers("d", coefficients)
+    k = reader.numbers("d", 9)
+    reader.numbers("d", 9 + 12)  # R and P
+    binning_x, binning_y, x, y, region_height, region_width = reader.numbers("I", 6)
+    reader.number("B")  # do_rectify
+    binning, offset, region = (binning_x, binning_y), (x, y), (region_width, region_height)
+    return CameraInfo(frame_id, width, height, model, distortion, k, binning, offset, region)
 
 
-def image_size(data: bytes, type_name: str) -> tuple[int, int] | None:
-    """(width, height) of an image message [px]; a compressed image is decoded for it. None where it is damaged."""
-    try:
-        reader = _Reader(data)
-        reader.header()
-        if type_name == IMAGE:
-            height, width = reader.numbers("I", 2)
-            return width, height
-        reader.string()
-        length = reader.number("I")
-    except (struct.error, IndexError):
-        return None
-    import cv2
+def read_image(data: bytes, type_name: str) -> ImageFields:
+    """An Image or CompressedImage from its CDR bytes, read to its end; ValueError where they are damaged.
 
-    encoded = np.frombuffer(data, np.uint8, offset=reader.position)[:length]
-    image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if len(encoded) else None
-    return None if image is None else (image.shape[1], image.shape[0])
-
-
-def image_encoding(data: bytes, type_name: str) -> str:
-    """The encoding of a raw image, the format of a compressed one; empty where the message is damaged."""
-    try:
-        reader = _Reader(data)
-        reader.header()
-        if type_name == IMAGE:
-            reader.numbers("I", 2)
-        return reader.string()
-    except (struct.error, IndexError):
-        return ""
-
-
-def is_whole(data: bytes, type_name: str) -> bool:
-    """Whether an image message is as long as its length field says; the pixels are not decoded."""
-    try:
-        reader = _Reader(data)
-        reader.header()
-        if type_name == IMAGE:
-            reader.numbers("I", 2)
-        reader.string()
-        if type_name == IMAGE:
-            reader.numbers("B", 1)
-            reader.number("I")
-        length = reader.number("I")
-    except (struct.error, IndexError):
-        return False
-    return len(data) >= reader.position + length
+    The pixels are not decoded. Raises StampError where only the stamp cannot be used.
+    """
+    reader = _Reader(data)
+    stamp, frame_id = reader.header()
+    if type_name == COMPRESSED_IMAGE:
+        return ImageFields(stamp, frame_id, reader.string(), reader.bytes())
+    height, width = reader.numbers("I", 2)
+    encoding = reader.string()
+    reader.number("B")  # is_bigendian
+    step = reader.number("I")
+    return ImageFields(stamp, frame_id, encoding, reader.bytes(), width, height, step)
 
 
 def write(type_name: str, content: Mapping[str, Any]) -> bytes:

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mcap files of a recording: one file, or those that the metadata.yaml of a rosbag2 folder names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_BAG_PARTS
+
+_LISTED = 5  # names that an error lists
+
+
+def parts(path: Path) -> list[Path]:
+    """The mcap files of the recording `path`, in order; raises InputError where it is none or files are missing."""
+    if not path.exists():
+        raise InputError(f"no such bag: {path}")
+    if path.is_dir():
+        return _named_files(path, _information(path))
+    if not path.is_file():
+        raise InputError(f"{path} is a device or a pipe: give an .mcap file or a rosbag2 folder")
+    return [path]
+
+
+def _information(path: Path) -> dict[str, Any]:
+    """What metadata.yaml says of the recording's storage."""
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        inside = sorted(file.name for file in path.glob("*.mcap"))
+        remedy = f"give one of its files ({_listed(inside)}) or run" if inside else "give a rosbag2 folder, or run"
+        raise InputError(f"{path} has no metadata.yaml: {remedy} `ros2 bag reindex {path}`")
+    try:
+        information = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+    except (yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError) as error:
+        raise InputError(f"{metadata} is no rosbag2 metadata ({error}): run `ros2 bag reindex {path}`") from None
+    if not isinstance(information, dict) or not isinstance(information.get("relative_file_paths"), list):
+        raise InputError(f"{metadata} is no rosbag2 metadata (no relative_file_paths): run `ros2 bag reindex {path}`")
+    return information
+
+
+def _named_files(path: Path, information: dict[str, Any]) -> list[Path]:
+    """The files that the metadata names; all lie in the folder."""
+    metadata = path / "metadata.yaml"
+    storage = str(information.get("storage_identifier", "mcap"))[:40]
+    if storage != "mcap":
+        raise InputError(f"{path} is stored as {storage}: convert it with `ros2 bag convert` (storage_id: mcap)")
+    if str(information.get("compression_mode", ""))[:40].upper() == "FILE":
+        raise InputError(f"{path} is compressed file by file: decompress it with `ros2 bag convert`")
+    names = information["relative_file_paths"]
+    if not names:
+        raise InputError(f"{metadata} names no file: the recording is empty")
+    if len(names) > MAX_BAG_PARTS:
+        raise InputError(f"{metadata} names {len(names)} files: {MAX_BAG_PARTS} at most are read; split the recording")
+    files = [_inside(path, name) for name in names]
+    if len({*files}) < len(files):
+        raise InputError(f"{metadata} names a file twice: run `ros2 bag reindex {path}`")
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise InputError(f"{path}: {_listed(missing)} named in metadata.yaml is missing: copy the folder again")
+    return files
+
+
+def _inside(path: Path, name: Any) -> Path:
+    """The file of that name in the folder; before Foxy the names were relative to the folder above."""
+    if not isinstance(name, str) or not name.isprintable() or len(name) > 255 or ".." in Path(name).parts:
+        raise InputError(
+            f"{path / 'metadata.yaml'} names {str(name)[:40]!r}, no file in its folder: run `ros2 bag reindex {path}`"
+        )
+    is_there = not Path(name).is_absolute() and (path / name).exists()
+    return path / name if is_there else path / Path(name).name
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more
