@@ -6,10 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import MAX_BAG_PARTS
+from pipeprog_camera.limits import MAX_BAG_PARTS, MAX_METADATA
+from pipeprog_camera.outside_text import shown
+from pipeprog_camera.yaml_file import read_yaml
 
 _LISTED = 5  # names that an error lists
 
@@ -32,12 +32,14 @@ def _information(path: Path) -> dict[str, Any]:
         inside = sorted(file.name for file in path.glob("*.mcap"))
         remedy = f"give one of its files ({_listed(inside)}) or run" if inside else "give a rosbag2 folder, or run"
         raise InputError(f"{path} has no metadata.yaml: {remedy} `ros2 bag reindex {path}`")
+    remedy = f"run `ros2 bag reindex {path}`"
     try:
-        information = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
-    except (yaml.YAMLError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise InputError(f"{metadata} is no rosbag2 metadata ({error}): run `ros2 bag reindex {path}`") from None
+        content = read_yaml(metadata, MAX_METADATA)
+    except InputError as error:
+        raise InputError(f"no rosbag2 metadata: {error}; {remedy}") from None
+    information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     if not isinstance(information, dict) or not isinstance(information.get("relative_file_paths"), list):
-        raise InputError(f"{metadata} is no rosbag2 metadata (no relative_file_paths): run `ros2 bag reindex {path}`")
+        raise InputError(f"{metadata} is no rosbag2 metadata (it has no relative_file_paths): {remedy}")
     return information
 
 
@@ -67,7 +69,7 @@ def _inside(path: Path, name: Any) -> Path:
     """The file of that name in the folder; before Foxy the names were relative to the folder above."""
     if not isinstance(name, str) or not name.isprintable() or len(name) > 255 or ".." in Path(name).parts:
         raise InputError(
-            f"{path / 'metadata.yaml'} names {str(name)[:40]!r}, no file in its folder: run `ros2 bag reindex {path}`"
+            f"{path / 'metadata.yaml'} names {shown(name)}, no file in its folder: run `ros2 bag reindex {path}`"
         )
     is_there = not Path(name).is_absolute() and (path / name).exists()
     return path / name if is_there else path / Path(name).name
