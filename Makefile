@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := out/demo
+SECONDS ?= 600
+SEED ?= 1
 
 .DEFAULT_GOAL := help
 .SHELLFLAGS := -eu -c
@@ -55,6 +57,9 @@ lint: setup ## ruff and mypy
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 
+fuzz: setup ## spoiled input for every reader, SECONDS=600 on SEED=1
+	@$(BIN)/python -m tests.fuzz --seconds $(SECONDS) --seed $(SEED)
+
 accuracy: setup ## accuracy against ground truth (slower than the tests)
 	@$(BIN)/python -m pytest -s tests/accuracy
 
@@ -68,4 +73,4 @@ docs: setup ## pages of all modules, from their docstrings, in out/docs
 clean: ## remove what was built, the environment included
 	@rm -rf $(VENV) build install log out
 
-.PHONY: help setup demo test lint accuracy experiments docs clean
+.PHONY: help setup demo test lint fuzz accuracy experiments docs clean

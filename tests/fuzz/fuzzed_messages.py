@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages as faulty and hostile publishers send them, of every type that the nodes subscribe to.
 
-All randomness comes from the `random.Random` that is given: the same seed gives the same messages, and Hypothesis can
-give one of its own (`strategies.randoms`) and shrink what fails.
+All randomness comes from the `random.Random` that is given: the same seed gives the same messages.
 """
 
 from __future__ import annotations
@@ -295,7 +294,7 @@ def jpeg_of_scans(scans: int) -> bytes:
     return encoded[:last] + encoded[last:-2] * scans + encoded[-2:]
 
 
-_IMAGES = (
+IMAGES = (
     *(
         png_header(*size)
         for size in ((100_000, 100_000), (2**31 - 1, 1), (1, 1), (0, 0), (31, 31), (32, 32), (8192, 8192))
@@ -314,7 +313,7 @@ _IMAGES = (
 
 
 def _image_bomb(message: CompressedImage, rng: random.Random) -> None:
-    message.data = array("B", rng.choice(_IMAGES))
+    message.data = array("B", rng.choice(IMAGES))
 
 
 def _raw_image_bomb(message: Image, rng: random.Random) -> None:
