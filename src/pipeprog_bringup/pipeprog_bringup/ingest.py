@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from pipeprog_bringup.recording import cdr
@@ -19,6 +18,8 @@ from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results.atomic_output import output_file
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.outside_text import name_of, shown
+from pipeprog_camera.yaml_file import line_of, read_yaml
 
 FRAME_ID = "camera_optical_frame"
 # Stamp of the first image [ns]: a video has no clock, and zero means "not set" in ROS.
@@ -71,25 +72,46 @@ def ingest(
 
 def read_camera(path: Path) -> Camera:
     """A calibration in the YAML format of ROS's camera_calibration; raises InputError where it is none."""
+    content = read_yaml(path)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: the calibration cannot be read ({' '.join(str(error).split())})") from None
-    try:
-        size = int(content["image_width"]), int(content["image_height"])
-        matrix = np.asarray(content["camera_matrix"]["data"], float).reshape(3, 3)
-        distortion = [float(value) for value in content["distortion_coefficients"]["data"]]
-        model = str(content.get("distortion_model", content.get("camera_model", "plumb_bob")))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        if not isinstance(content, dict):
+            raise InputError("it is no mapping")
+        width, height = (int(_number(content, key, content.get(key))) for key in ("image_width", "image_height"))
+        matrix, distortion = (_numbers(content, key) for key in ("camera_matrix", "distortion_coefficients"))
+        if len(matrix) != 9:
+            raise InputError(f"camera_matrix.data holds {len(matrix)} numbers, not 9")
+        model = content.get("distortion_model", content.get("camera_model", "plumb_bob"))
+        model = name_of(model, "distortion_model")
+    except InputError as error:
         raise InputError(
-            f"{path} is no camera calibration ({what}): it needs image_width, image_height, camera_matrix.data, "
+            f"{path} is no camera calibration ({error}): it needs image_width, image_height, camera_matrix.data, "
             "distortion_model, distortion_coefficients.data"
         ) from None
     try:
-        return Camera.from_calibration(*size, matrix, model, distortion)
+        return Camera.from_calibration(width, height, matrix, model, distortion)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _numbers(content: dict[str, Any], key: str) -> list[float]:
+    """The `data` of a matrix of a calibration."""
+    data = content[key].get("data") if isinstance(content.get(key), dict) else None
+    if not isinstance(data, list):
+        raise InputError(f"{key}.data is missing")
+    return [_number(content, f"{key}.data", value) for value in data]
+
+
+def _number(content: dict[str, Any], key: str, value: Any) -> float:
+    """A finite number of a calibration, which some tools quote."""
+    if value is None:
+        raise InputError(f"{key} is missing")
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise InputError(f"{key}{line_of(content, key.partition('.')[0])} holds {shown(value)}, which is no number")
+    return number
 
 
 def _open(video: Path) -> Any:

@@ -41,6 +41,16 @@ MAX_CAMERAS = 64  # keyframes of one moment: more cameras than any robot has
 MAX_NAME = 256  # characters of a frame or class name; ROS 2 limits topic names to as many
 MAX_SECONDS = 2**31 - 1  # s; builtin_interfaces/Time has 32 bits with a sign
 
+# Bills of quantities and board files.
+MAX_CLASSES = 1000  # planned classes; all sizes of EN 10220 in all their walls are 600
+MAX_PIPE_RADIUS = 50.0  # m; tunnels have 9
+MIN_PIPE_RADIUS = 1e-4  # m; capillaries have 0.5 mm, and no camera sees them as pipes
+MAX_PIPE_LENGTH = 1e7  # m of one class; the Earth's quarter
+MAX_BOARD_CIRCLES = 256  # of one board; calibration targets have 20 x 14 at most, and symmetries go with the cube
+MAX_CIRCLES = 2000  # of all boards and scale bars of a site, which has ten boards of five
+MAX_KNOWN_DISTANCES = 1000  # between boards; each is measured by hand
+MAX_TARGET_LENGTH = 1e5  # m; a board's circles, and distances between boards on one site
+
 # Files of text.
 MAX_YAML = 1 << 20  # bytes; bills and boards have kilobytes, and libyaml reads a megabyte in under 2 s
 MAX_METADATA = 1 << 22  # bytes of a rosbag2 metadata.yaml; 10 000 files of a split recording take 1.5 MB

@@ -3,10 +3,17 @@
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Iterable, Mapping, Sized
 from itertools import islice
 from typing import Any
 
+from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_NAME
+
+# Line breaks, terminal sequences, what turns the direction of writing, and halves of surrogate pairs.
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _SHOWN = 80  # characters of a value in a message; a line of a terminal has as many
 _SHOWN_ITEMS = 4  # of a list or mapping; a row of numbers in a board or bill has two to four
 _SHOWN_DEPTH = 2  # lists within lists that are shown, such as the rows of a board
@@ -16,6 +23,26 @@ def shown(value: Any) -> str:
     """A value as an error message shows it, on one line of at most 80 characters; control characters as escapes."""
     text = _shown(value, _SHOWN_DEPTH)
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def nearest(value: Any, names: Iterable[str]) -> str:
+    """The name that a wrong text comes closest to, for `did you mean`."""
+    return difflib.get_close_matches(str(value)[:MAX_NAME], list(names), n=1, cutoff=0.0)[0]
+
+
+def name_of(value: Any, where: str) -> str:
+    """A name that a file gives as a text or number, without spaces around it.
+
+    Raises InputError, which begins with `where`, for what is no text, empty, longer than MAX_NAME or not one line.
+    """
+    if not isinstance(value, str | int | float) or isinstance(value, bool) or not str(value).strip():
+        raise InputError(f"{where} is {shown(value)}: write a name")
+    name = str(value).strip()
+    if len(name) > MAX_NAME:
+        raise InputError(f"{where} is a name of {len(name)} characters: write {MAX_NAME} at most")
+    if _CONTROL.search(name):
+        raise InputError(f"{where} is {shown(name)}: write a name on one line, without control characters")
+    return name
 
 
 def _shown(value: Any, depth: int) -> str:

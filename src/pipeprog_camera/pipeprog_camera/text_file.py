@@ -8,6 +8,7 @@ import stat
 from pathlib import Path
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.outside_text import shown
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -37,12 +38,10 @@ def require_regular(path: str | Path) -> None:
     """Raises InputError where there is no regular file (or a link to one)."""
     try:
         mode = os.stat(path).st_mode
-    except FileNotFoundError:
-        raise InputError(f"no such file: {path}") from None
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}): check the path") from None
+        raise InputError(f"{path}: cannot read the file ({error.strerror}): check the path") from None
     except ValueError:  # NUL, which no path has
-        raise InputError(f"{str(path)!r} cannot be read: it is no path") from None
+        raise InputError(f"{shown(str(path))} is no path: give the file's path") from None
     if not stat.S_ISREG(mode):
         raise InputError(f"{path} is {_KINDS.get(stat.S_IFMT(mode), 'something else')}: give a regular file")
 
@@ -54,7 +53,7 @@ def _read(path: str | Path, most: int) -> bytes:
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
             data = file.read(most + 1)
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}): check the path and its permissions") from None
+        raise InputError(f"{path}: cannot read the file ({error.strerror}): check its permissions") from None
     if len(data) > most:
         raise InputError(f"{path} is larger than {most / 2**20:g} MiB, which no such file is: check the path")
     return data

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,11 @@ def test_bad_videos_are_errors_and_leave_nothing(tmp_path: Path) -> None:
         ({"distortion_model": "wavy"}, "unknown distortion model 'wavy'"),
         ({"image_width": "wide"}, "no camera calibration"),
         ({"distortion_coefficients": None}, "no camera calibration"),
+        ({"image_width": math.inf}, r"image_width, line \d+ holds inf, which is no number"),
+        ({"image_width": [640]}, r"image_width, line \d+ holds \[640\], which is no number"),
+        ({"camera_matrix": {"data": "123456789"}}, "camera_matrix.data is missing"),
+        ({"camera_matrix": {"data": [{}] * 9}}, r"camera_matrix.data, line \d+ holds {}, which is no number"),
+        ({"distortion_model": ["plumb_bob"]}, r"distortion_model is \['plumb_bob'\]: write a name"),
     ],
 )
 def test_bad_calibrations_are_errors(tmp_path: Path, changes: dict[str, Any], expected: str) -> None:
@@ -131,6 +137,6 @@ def test_bad_calibrations_are_errors(tmp_path: Path, changes: dict[str, Any], ex
 
 def test_a_calibration_that_is_no_yaml(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("{")
-    for path in (tmp_path / "c.yaml", tmp_path / "absent.yaml"):
-        with pytest.raises(InputError, match="cannot be read"):
-            read_camera(path)
+    for name, expected in (("c.yaml", r"c\.yaml, line 2: is no YAML"), ("absent.yaml", r"absent\.yaml: cannot read")):
+        with pytest.raises(InputError, match=expected):
+            read_camera(tmp_path / name)

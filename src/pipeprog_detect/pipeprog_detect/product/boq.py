@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import yaml
-
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_CLASSES, MAX_PIPE_LENGTH, MAX_PIPE_RADIUS, MIN_PIPE_RADIUS
+from pipeprog_camera.outside_text import name_of, nearest, shown
+from pipeprog_camera.yaml_file import line_of, read_yaml
 from pipeprog_detect.product.standard_sizes import find_size, nearest_name
 
 Color = tuple[float, float, float]
@@ -95,15 +95,14 @@ class BillOfQuantities:
 
         Raises InputError where there is no class or a radius is no length.
         """
-        where = Path("radii")
         classes = [
             PipeClass(name, radius, math.nan, (0.5, 0.5, 0.5), max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE))
             for name, radius in radii.items()
-            if _positive(where, f"class '{name}'", "the outer radius in metres", radius)
+            if _positive(f"radii: class {shown(name)}", "the outer radius in metres", radius)
         ]
         if not classes:
             raise InputError("radii: no class is given: name at least one planned outer radius in metres")
-        return cls(_with_colors(where, classes, [{}] * len(classes)))
+        return cls(_with_colors(classes, [None] * len(classes)))
 
 
 def load_boq(path: str | Path) -> BillOfQuantities:
@@ -114,97 +113,99 @@ def load_boq(path: str | Path) -> BillOfQuantities:
     Raises InputError, naming the file, the value and the remedy, for anything that is no bill of quantities.
     """
     path = Path(path)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the bill of quantities ({error.strerror}): check the path") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        line = " ".join(str(error).split())
-        raise InputError(f"{path}: is no YAML ({line}): write it as in the README's example") from error
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no mapping: a bill of quantities begins with 'classes:'")
-    _refuse_unknown(path, "the file", content, ("classes",))
+    _refuse_unknown(str(path), "the file", content, ("classes",))
     entries = content.get("classes")
     if not isinstance(entries, list) or not entries:
         raise InputError(
-            f"{path}: classes is {entries!r}: list at least one class with name, radius and planned length"
+            f"{path}{line_of(content, 'classes')}: classes is {shown(entries)}: "
+            "list at least one class with name, radius and planned length"
         )
+    if len(entries) > MAX_CLASSES:
+        raise InputError(f"{path}: {len(entries)} classes: plan {MAX_CLASSES} at most, or split the bill by trades")
     classes: list[PipeClass] = []
-    for number, entry in enumerate(entries, start=1):
-        new = _read_class(path, f"class {number}", entry)
-        for old in classes:
-            if old.name == new.name:
-                raise InputError(
-                    f"{path}: class '{new.name}' is listed twice: keep one, or give the other its own name"
-                )
-            if math.isclose(old.outer_radius, new.outer_radius, rel_tol=1e-6):
-                raise InputError(
-                    f"{path}: classes '{old.name}' and '{new.name}' have the same outer radius "
-                    f"{1e3 * new.outer_radius:g} mm and cannot be told apart: merge them"
-                )
+    colors: list[Color | None] = []
+    for number, entry in enumerate(entries):
+        where = f"{path}{line_of(entries, number)}"
+        new = _read_class(where, number + 1, entry)
+        _refuse_double(where, new, classes)
         classes.append(new)
-    return BillOfQuantities(_with_colors(path, classes, entries))
+        colors.append(_read_color(f"{where}: class {shown(new.name)}", entry["color"]) if "color" in entry else None)
+    return BillOfQuantities(_with_colors(classes, colors))
 
 
-def _read_class(path: Path, where: str, entry: object) -> PipeClass:
+def _refuse_double(where: str, new: PipeClass, classes: list[PipeClass]) -> None:
+    for old in classes:
+        if old.name == new.name:
+            raise InputError(
+                f"{where}: class {shown(new.name)} is listed twice: keep one, or give the other its own name"
+            )
+        if math.isclose(old.outer_radius, new.outer_radius, rel_tol=1e-6):
+            raise InputError(
+                f"{where}: classes {shown(old.name)} and {shown(new.name)} have the same outer radius "
+                f"{1e3 * new.outer_radius:g} mm and cannot be told apart: merge them"
+            )
+
+
+def _read_class(where: str, number: int, entry: object) -> PipeClass:
     if not isinstance(entry, dict):
-        raise InputError(f"{path}: {where} is {entry!r}: write name, outer_radius_mm and planned_length_m")
-    name = entry.get("name")
-    if not isinstance(name, str | int | float) or isinstance(name, bool) or not str(name).strip():
-        raise InputError(f"{path}: {where} has the name {name!r}: give each class a name")
-    name = str(name).strip()
-    where = f"class '{name}'"
-    _refuse_unknown(path, where, entry, _KEYS)
-    radius, tolerance = _read_size(path, where, entry)
+        raise InputError(f"{where}: class {number} is {shown(entry)}: write name, outer_radius_mm and planned_length_m")
+    if "name" not in entry:
+        raise InputError(f"{where}: class {number} has no name: give each class a name")
+    name = name_of(entry["name"], f"{where}: the name of class {number}")
+    _refuse_unknown(where, f"class {shown(name)}", entry, _KEYS)
+    where = f"{where}: class {shown(name)}"
+    radius, tolerance = _read_size(where, entry)
+    if not MIN_PIPE_RADIUS <= radius <= MAX_PIPE_RADIUS:
+        raise InputError(f"{where}: an outer radius of {radius:g} m is that of no pipe: write millimetres")
     if "planned_length_m" not in entry:
-        raise InputError(f"{path}: {where} has no planned_length_m: give the metres that are planned")
-    length = _positive(path, where, "planned_length_m", entry["planned_length_m"])
-    wall = 1e-3 * _positive(path, where, "wall_mm", entry["wall_mm"]) if "wall_mm" in entry else None
+        raise InputError(f"{where} has no planned_length_m: give the metres that are planned")
+    length = _positive(where, "planned_length_m", entry["planned_length_m"])
+    if length > MAX_PIPE_LENGTH:
+        raise InputError(f"{where}: planned_length_m is {length:g}: write metres, {MAX_PIPE_LENGTH:g} at most")
+    wall = 1e-3 * _positive(where, "wall_mm", entry["wall_mm"]) if "wall_mm" in entry else None
     if wall is not None and wall >= radius:
-        raise InputError(
-            f"{path}: {where}: wall_mm is {1e3 * wall:g}, more than the radius: write the wall's thickness"
-        )
+        raise InputError(f"{where}: wall_mm is {1e3 * wall:g}, more than the radius: write the wall's thickness")
     return PipeClass(name, radius, length, (0.5, 0.5, 0.5), tolerance, wall)
 
 
-def _read_size(path: Path, where: str, entry: dict[str, object]) -> tuple[float, float]:
+def _read_size(where: str, entry: dict[str, object]) -> tuple[float, float]:
     """Outer radius and its tolerance [m]."""
     given = [key for key in _SIZE_KEYS if key in entry]
     if len(given) != 1:
         raise InputError(
-            f"{path}: {where} needs one of {', '.join(_SIZE_KEYS)}, not {' and '.join(given) if given else 'none'}"
+            f"{where} needs one of {', '.join(_SIZE_KEYS)}, not {' and '.join(given) if given else 'none'}"
         )
     value = entry[given[0]]
     if given[0] == "size":
-        size = find_size(str(value))
+        text = name_of(value, f"{where}: size")
+        size = find_size(text)
         if size is None:
-            raise InputError(f"{path}: {where}: unknown size '{value}': did you mean '{nearest_name(str(value))}'?")
+            raise InputError(f"{where}: unknown size {shown(text)}: did you mean '{nearest_name(text)}'?")
         return 0.5 * size.outer_diameter, 0.5 * size.tolerance
-    millimetres = _positive(path, where, given[0], value)
+    millimetres = _positive(where, given[0], value)
     radius = 1e-3 * millimetres * (1.0 if given[0] == "outer_radius_mm" else 0.5)
     return radius, max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE)
 
 
-def _positive(path: Path, where: str, key: str, value: object) -> float:
+def _positive(where: str, key: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{path}: {where}: {key} is {value!r}: write a number")
+        raise InputError(f"{where}: {key} is {shown(value)}: write a number")
     if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{path}: {where}: {key} is {value}: write a number above zero")
+        raise InputError(f"{where}: {key} is {shown(value)}: write a number above zero")
     return float(value)
 
 
-def _refuse_unknown(path: Path, where: str, entry: dict[object, object], known: tuple[str, ...]) -> None:
+def _refuse_unknown(where: str, what: str, entry: dict[object, object], known: tuple[str, ...]) -> None:
     for key in entry:
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)
-            raise InputError(f"{path}: unknown key '{key}' in {where}: did you mean '{near[0]}'?")
+            raise InputError(f"{where}: unknown key {shown(key)} in {what}: did you mean '{nearest(key, known)}'?")
 
 
-def _with_colors(path: Path, classes: list[PipeClass], entries: list[dict[str, object]]) -> tuple[PipeClass, ...]:
-    given = [
-        _read_color(path, new.name, entry["color"]) if "color" in entry else None
-        for new, entry in zip(classes, entries, strict=True)
-    ]
+def _with_colors(classes: list[PipeClass], given: list[Color | None]) -> tuple[PipeClass, ...]:
+    """The classes with the colours that are given (None: by outer radius, else one that tells them apart)."""
     colors: list[Color | None] = []
     for new, color in zip(classes, given, strict=True):
         known = [name for radius, name in _FIGURE_11.items() if abs(radius - new.outer_radius) < 2e-4]
@@ -220,8 +221,8 @@ def _with_colors(path: Path, classes: list[PipeClass], entries: list[dict[str, o
     return tuple(done)
 
 
-def _read_color(path: Path, name: str, value: object) -> Color:
-    text = str(value).strip().lower()
+def _read_color(where: str, value: object) -> Color:
+    text = name_of(value, f"{where}: color").lower()
     if text in NAMED_COLORS:
         return NAMED_COLORS[text]
     if re.fullmatch(r"#[0-9a-f]{6}", text):
@@ -231,5 +232,5 @@ def _read_color(path: Path, name: str, value: object) -> Color:
     if text in CSS4_COLORS:
         red, green, blue = to_rgb(text)
         return (red, green, blue)
-    near = difflib.get_close_matches(text, [*NAMED_COLORS, *CSS4_COLORS], n=1, cutoff=0.0)[0]
-    raise InputError(f"{path}: class '{name}': unknown color '{value}': did you mean '{near}'? #rrggbb is fine too")
+    near = nearest(text, [*NAMED_COLORS, *CSS4_COLORS])
+    raise InputError(f"{where}: unknown color {shown(text)}: did you mean '{near}'? #rrggbb is fine too")

@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_BOARD_CIRCLES, MAX_CIRCLES, MAX_KNOWN_DISTANCES, MAX_TARGET_LENGTH
+from pipeprog_camera.outside_text import name_of, nearest, shown
+from pipeprog_camera.yaml_file import line_of, read_yaml
 from pipeprog_sfm.boards.board import MIN_CIRCLES, Board, symmetries
 
 
@@ -90,22 +91,41 @@ def load_board_file(path: str | Path) -> BoardFile:
             that looks the same turned by 120 degrees or less, or a name that is taken, a distance ends at a circle
             that is not in the file, or the discs of a scale bar overlap.
     """
-    content = _content(path)
+    content = read_yaml(path)
+    keys = () if isinstance(content, dict) and "marks" in content else ("boards",)
+    content = _entry(content, keys, str(path), optional=("boards", "distances", "marks"))
     entries = {key: content.get(key, []) for key in ("boards", "distances", "marks")}
     for key, rows in entries.items():
         if not isinstance(rows, list):
-            raise InputError(f"{path}: '{key}' must be a list")
+            raise InputError(f"{path}{line_of(content, key)}: '{key}' must be a list")
     if not entries["boards"] and not entries["marks"]:
         raise InputError(f"{path}: 'boards' must be a list with at least one board (or give a pair of 'marks')")
+    _check_counts(path, entries)
     boards: list[Board] = []
     for number, entry in enumerate(entries["boards"], 1):
-        board = _board(entry, f"{path}: board {number}")
+        board = _board(entry, f"{path}{line_of(entries['boards'], number - 1)}: board {number}")
         if board.name in [other.name for other in boards]:
-            raise InputError(f"{path}: the name '{board.name}' is given to two boards: names must be unique")
+            raise InputError(f"{path}: the name {shown(board.name)} is given to two boards: names must be unique")
         boards.append(board)
-    distances = [_distance(entry, f"{path}: distance {k}", boards) for k, entry in enumerate(entries["distances"], 1)]
-    bars = [_scale_bar(entry, f"{path}: marks {k}", f"marks {k}") for k, entry in enumerate(entries["marks"], 1)]
+    distances = [
+        _distance(entry, f"{path}{line_of(entries['distances'], number - 1)}: distance {number}", boards)
+        for number, entry in enumerate(entries["distances"], 1)
+    ]
+    bars = [
+        _scale_bar(entry, f"{path}{line_of(entries['marks'], number - 1)}: marks {number}", f"marks {number}")
+        for number, entry in enumerate(entries["marks"], 1)
+    ]
     return BoardFile(tuple(boards), tuple(distances), tuple(bars))
+
+
+def _check_counts(path: str | Path, entries: Mapping[str, list[Any]]) -> None:
+    """Refuses more circles or distances than a site has, before anything is computed of them."""
+    rows = [entry.get("centres_mm") for entry in entries["boards"] if isinstance(entry, dict)]
+    circles = sum(len(row) for row in rows if isinstance(row, list)) + 2 * len(entries["marks"])
+    if max(circles, len(entries["boards"])) > MAX_CIRCLES:
+        raise InputError(f"{path}: {max(circles, len(entries['boards']))} circles: give {MAX_CIRCLES} at most")
+    if len(entries["distances"]) > MAX_KNOWN_DISTANCES:
+        raise InputError(f"{path}: {len(entries['distances'])} distances: give {MAX_KNOWN_DISTANCES} at most")
 
 
 def _distance(value: Any, where: str, boards: Sequence[Board]) -> KnownDistance:
@@ -114,16 +134,17 @@ def _distance(value: Any, where: str, boards: Sequence[Board]) -> KnownDistance:
     if not boards:
         raise InputError(f"{where}: distances lie between circles of boards, and the file has none: write it as marks")
     for key in ("from", "to"):
-        name, _, number = str(entry[key]).rpartition("/")
+        end = name_of(entry[key], f"{where}: {key}")
+        name, _, number = end.rpartition("/")
         count = next((len(board.centres) for board in boards if board.name == name), 0)
         if not number.isdecimal() or not 1 <= int(number) <= count:
             raise InputError(
-                f"{where}: '{key}: {entry[key]}' is no circle of the file: write BOARD/NUMBER, such as "
-                f"{boards[0].name}/1 for the first circle of board {boards[0].name}"
+                f"{where}: {shown(f'{key}: {end}')} is no circle of the file: write BOARD/NUMBER, such as "
+                f"{shown(f'{boards[0].name}/1')} for the first circle of board {shown(boards[0].name)}"
             )
         ends.append((name, int(number) - 1))
     if ends[0] == ends[1]:
-        raise InputError(f"{where}: both ends are {entry['from']}")
+        raise InputError(f"{where}: both ends are {shown(entry['from'])}")
     length, sigma = _length(entry, where)
     return KnownDistance(f"{entry['from']} to {entry['to']}", (ends[0], ends[1]), length, sigma)
 
@@ -153,25 +174,13 @@ def _circle_radius(entry: Mapping[str, Any], where: str) -> float:
     return radius / 1000
 
 
-def _content(path: str | Path) -> Mapping[str, Any]:
-    try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the board file cannot be read ({error})") from error
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from error
-    keys = () if isinstance(content, dict) and "marks" in content else ("boards",)
-    return _entry(content, keys, str(path), optional=("boards", "distances", "marks"))
-
-
 def _entry(value: Any, keys: Sequence[str], where: str, optional: Sequence[str] = ()) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise InputError(f"{where}: expected the keys {', '.join(keys)}, found {value!r}")
+        raise InputError(f"{where}: expected the keys {', '.join(keys)}, found {shown(value)}")
     known = (*keys, *optional)
     for key in value:
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, 1, 0.0)[0]
-            raise InputError(f"{where}: unknown key '{key}', did you mean '{near}'?")
+            raise InputError(f"{where}: unknown key {shown(key)}, did you mean '{nearest(key, known)}'?")
     for key in keys:
         if key not in value:
             raise InputError(f"{where}: the key '{key}' is missing")
@@ -180,14 +189,14 @@ def _entry(value: Any, keys: Sequence[str], where: str, optional: Sequence[str] 
 
 def _board(value: Any, where: str) -> Board:
     entry = _entry(value, ("name", "circle_radius_mm", "centres_mm"), where)
-    name = str(entry["name"])
-    where = f"{where} ('{name}')"
+    name = name_of(entry["name"], f"{where}: the name")
+    where = f"{where} ({shown(name)})"
     radius = 1000 * _circle_radius(entry, where)
     rows = entry["centres_mm"]
     if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 2 for row in rows):
         raise InputError(f"{where}: centres_mm must be a list of [x, y] pairs in millimetres")
-    if len(rows) < MIN_CIRCLES:
-        raise InputError(f"{where}: {len(rows)} circles, but a board needs {MIN_CIRCLES} or more")
+    if not MIN_CIRCLES <= len(rows) <= MAX_BOARD_CIRCLES:
+        raise InputError(f"{where}: {len(rows)} circles, but a board needs {MIN_CIRCLES} to {MAX_BOARD_CIRCLES}")
     flat = np.array([[_number(number, f"{where}: centres_mm") for number in row] for row in rows])
     apart = np.linalg.norm(flat[:, None] - flat[None], axis=-1) + np.diag(np.full(len(flat), np.inf))
     if apart.min() <= 2 * radius:
@@ -205,6 +214,8 @@ def _board(value: Any, where: str) -> Board:
 
 
 def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f"{where}: {value!r} is not a number")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(float(value)):
+        raise InputError(f"{where}: {shown(value)} is not a number")
+    if abs(value) > 1000 * MAX_TARGET_LENGTH:
+        raise InputError(f"{where}: {value:g} is beyond any site: give millimetres")
     return float(value)

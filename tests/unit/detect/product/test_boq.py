@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+import time
 from pathlib import Path
 
 import pytest
@@ -113,6 +115,43 @@ def test_a_wrong_boq_is_reported_with_its_remedy(tmp_path: Path, text: str, told
         load_boq(path)
     assert told in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (entry("outer_radius_mm: 3").replace("DN65", "2001-99-99") + "\nclases: 1", "unknown key 'clases'"),
+        (entry("outer_radius_mm: 3").replace("DN65", '"a\\nb"'), "write a name on one line"),
+        (entry("outer_radius_mm: 3").replace("DN65", "x" * 257), "a name of 257 characters"),
+        (entry("outer_radius_mm: 3").replace("DN65", "[a]"), "the name of class 1 is ['a']: write a name"),
+        (entry("outer_radius_mm: 1.0e+400"), "outer_radius_mm is inf: write a number above zero"),
+        (entry("outer_radius_mm: 1" + "0" * 90), "is that of no pipe"),
+        (entry("outer_radius_mm: 1.0e-300"), "is that of no pipe"),
+        (entry("outer_radius_mm: 3").replace("3.0", "1" + "0" * 90), "planned_length_m is 1e+90: write metres"),
+        ("classes:\n" + "- {name: a}\n" * 1001, "1001 classes: plan 1000 at most"),
+        (f"a: &a [{'x,' * 900}]\nb: &b [{'*a,' * 900}]\nclasses: *b", "line 3: more than 1000000 values"),
+        (f"classes: {{a: &a [{'x,' * 900}], b: [{'*a,' * 900}]}}", "classes is {'a': ['x', 'x', 'x', 'x', …]"),
+        (f"classes: [{{name: [&a [{'x,' * 900}], {'*a,' * 900}]}}]", "class 1 is [["),
+        (entry("outer_radius_mm: 3, color: [&a [x, x], *a]"), "color is [['x', 'x'], ['x', 'x']]: write a name"),
+        (entry("size: {a: b}"), "size is {'a': 'b'}: write a name"),
+        (entry("size: " + "9" * 99), "unknown size '9999"),
+        ("classes:\n- name: a\n  outer_radius_mm: 3\n  planned_length_m: 1\n- 3", "line 5: class 2 is 3"),
+    ],
+    ids=lambda text: repr(text)[:40],
+)
+def test_a_hostile_boq_is_reported_with_its_remedy(tmp_path: Path, text: str, told: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(InputError, match="^" + re.escape(str(path))) as caught:
+        load_boq(path)
+    assert told in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 400
+
+
+def test_a_bill_of_as_many_classes_as_there_may_be_is_read_at_once(tmp_path: Path) -> None:
+    rows = [f"- {{name: c{k}, outer_radius_mm: {10 + k}, planned_length_m: 1}}" for k in range(1000)]
+    start = time.process_time()
+    assert len(load_boq(written(tmp_path, "classes:\n" + "\n".join(rows))).classes) == 1000
+    assert time.process_time() - start < 10.0
 
 
 def test_a_wall_is_for_cameras_inside(tmp_path: Path) -> None:

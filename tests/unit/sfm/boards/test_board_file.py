@@ -1,4 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
+import time
+
+import numpy as np
 import pytest
 from targets import BOARD
 
@@ -54,6 +57,45 @@ def test_refuses_a_bad_file_and_says_why(tmp_path, old, new, words):
         load_board_file(path)
     for word in [*words, str(path)]:
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("name: A", "name: [A]", ["line 2", "['A']", "write a name"]),
+        ("name: A", 'name: "A\\e[31m"', ["line 2", "control character"]),
+        ("circle_radius_mm: 40", "circle_radius_mm: 1" + "0" * 400, ["line 3", "401 characters"]),
+        ("circle_radius_mm: 40", "circle_radius_mm: 1" + "0" * 90, ["beyond any site"]),
+        ("[0, 0]", "[0, {a: b}]", ["{'a': 'b'}", "number"]),
+        ("[0, 0]", ", ".join(f"[{k % 20}00, {k // 20}00]" for k in range(257)), ["board needs 3 to 256"]),
+        ("[0, 0]", ", ".join(["[0, 0]"] * 20_000), ["20004 circles", "2000 at most"]),
+        (GOOD, GOOD + "distances: [" + "1," * 1001 + "]", ["1001 distances"]),
+        (GOOD, "marks: [" + "1," * 1001 + "]", ["2002 circles"]),
+        (GOOD, "boards: [" + "1," * 2001 + "]", ["2001 circles"]),
+        (GOOD, f"boards: [[&a [{'x,' * 900}], {'*a,' * 900}]]", ["board 1", "expected the keys"]),
+        (GOOD, GOOD + "  - {name: B, name: C}\n", ["line 5", "line 5 already"]),
+    ],
+    ids=lambda text: repr(text)[:40],
+)
+def test_refuses_a_hostile_file_and_says_why(tmp_path, old, new, words):
+    path = tmp_path / "board.yaml"
+    path.write_text(GOOD.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        load_board_file(path)
+    for word in [*words, str(path)]:
+        assert word in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 400
+
+
+def test_boards_of_as_many_circles_as_there_may_be_are_read_at_once(tmp_path):
+    path = tmp_path / "board.yaml"
+    angles = np.arange(256) * (2 * np.pi / 257)  # a ring with a gap, on which all turns must be tried
+    ring = [[round(float(9000 * np.cos(angle)), 3), round(float(9000 * np.sin(angle)), 3)] for angle in angles]
+    rows = [f"  - {{name: b{k}, circle_radius_mm: 40, centres_mm: {ring}}}\n" for k in range(7)]
+    path.write_text("boards:\n" + "".join(rows))
+    start = time.process_time()
+    assert len(load_board_file(path).boards) == 7
+    assert time.process_time() - start < 10.0
 
 
 def test_a_missing_file_is_named(tmp_path):
