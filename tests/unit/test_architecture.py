@@ -35,6 +35,7 @@ GLUE = {
         "discovery",
         "finish",
         "intake",
+        "keyframe_input",
         "messages",
         "main",
         "received",

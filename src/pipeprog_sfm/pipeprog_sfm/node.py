@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,40 +16,35 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, CompressedImage, Imu, PointCloud2
+from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.limits import (
-    MAX_CAMERAS,
-    MAX_ENCODED_IMAGE,
     MAX_TRANSFORM_FRAMES,
-    MAX_UNPAIRED,
     MAX_WAITING_MOTION,
 )
 from pipeprog_msgs import msg, srv
 from pipeprog_node import messages, qos, received
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.intake import Intake, InvalidMessageError
+from pipeprog_node.keyframe_input import KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 from pipeprog_node.received import (
     ReceivedAcceleration,
-    ReceivedCamera,
-    ReceivedImage,
     ReceivedRetirement,
     ReceivedTransform,
     ReceivedTransforms,
 )
+from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 from pipeprog_sfm.config import SfmConfig
-from pipeprog_sfm.journal import Journal
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
 from pipeprog_sfm.sparse.overlap import OverlapReport
-from pipeprog_sfm.supervisor import MAX_BACKLOG, ReconstructionLostError, Supervisor
 from pipeprog_sfm.worker import (
     AddKeyframe,
     Event,
@@ -62,11 +58,11 @@ from pipeprog_sfm.worker import (
     serve,
 )
 
-IMAGES, CALIBRATIONS, RETIRED = "keyframes/image/compressed", "keyframes/camera_info", "keyframes/retired"
+RETIRED = "keyframes/retired"
+MAX_BACKLOG = 50  # commands that wait for the process; as deep as the keyframes' topic
 STATUS_PERIOD = 0.2  # s, at most, from a message of motion to the status that counts it
+WAKE_PERIOD = 1.0  # s between two looks whether a reconstruction that died too often is to be started again
 MAX_MOTION = 1000  # messages of odometry, TF or IMU that wait for this process: a second and more of the fastest IMU
-
-_Key = tuple[int, str]  # stamp [ns] and frame of a camera
 
 
 class MotionInput:
@@ -144,76 +140,6 @@ class MotionInput:
             return False
         self._frames.update(frames)
         return True
-
-
-class KeyframeInput:
-    """Subscribes to keyframes: an image and its calibration are handed on once both have come.
-
-    Cameras of one body may be triggered together: a nanosecond tells their images apart.
-    """
-
-    def __init__(self, intake: Intake, use: Callable[[int, bytes, Camera, str], None]) -> None:
-        self._intake, self._use = intake, use
-        self._images: dict[_Key, bytes] = {}  # without calibration
-        self._cameras: dict[_Key, Camera] = {}  # without image
-        self._stamps: dict[_Key, int] = {}  # of the keyframes handed on: theirs alone
-        self._keys: dict[int, _Key] = {}  # the reverse
-        depth = qos.reliable(MAX_BACKLOG)
-        intake.subscribe(CompressedImage, IMAGES, received.compressed_image, self._on_image, depth)
-        intake.subscribe(CameraInfo, CALIBRATIONS, received.camera_info, self._on_camera, depth)
-
-    def frame_id(self, stamp: int) -> str:
-        """The frame of the camera of a keyframe that was handed on."""
-        return self._keys[stamp][1]
-
-    def forget(self, stamps: Iterable[int]) -> None:
-        """Keyframes of these stamps may come again."""
-        for stamp in stamps:
-            if stamp in self._keys:
-                del self._stamps[self._keys.pop(stamp)]
-
-    def _on_image(self, image: ReceivedImage) -> None:
-        key = image.stamp, image.frame_id
-        if self._is_new(key, IMAGES):
-            self._images[key] = image.encoded
-            self._pair(key)
-            while len(self._images) > 1 and (
-                len(self._images) > MAX_UNPAIRED or sum(map(len, self._images.values())) > MAX_ENCODED_IMAGE
-            ):
-                self._drop_oldest(self._images, IMAGES, "calibration")
-
-    def _on_camera(self, calibration: ReceivedCamera) -> None:
-        key = calibration.stamp, calibration.frame_id
-        if self._is_new(key, CALIBRATIONS):
-            self._cameras[key] = calibration.camera
-            self._pair(key)
-            if len(self._cameras) > MAX_UNPAIRED:
-                self._drop_oldest(self._cameras, CALIBRATIONS, "image")
-
-    def _is_new(self, key: _Key, topic: str) -> bool:
-        if key in self._stamps:
-            text = f"the keyframe of camera {key[1]!r} at {key[0]} ns came twice: is it published by two nodes?"
-            self._intake.reject(topic, InvalidMessageError("repeated", text))
-            return False
-        return True
-
-    def _drop_oldest(self, unpaired: dict[_Key, Any], topic: str, missing: str) -> None:
-        key = next(iter(unpaired))
-        del unpaired[key]
-        text = f"no {missing} of camera {key[1]!r} at {key[0]} ns has come: publish both with one stamp and frame_id"
-        self._intake.reject(topic, InvalidMessageError("unpaired", text))
-
-    def _pair(self, key: _Key) -> None:
-        if key not in self._images or key not in self._cameras:
-            return
-        image, camera = self._images.pop(key), self._cameras.pop(key)
-        stamp = next((stamp for stamp in range(key[0], key[0] + MAX_CAMERAS) if stamp not in self._keys), None)
-        if stamp is None:
-            text = f"{MAX_CAMERAS} keyframes at {key[0]} ns have come already: camera {key[1]!r} is left out"
-            self._intake.reject(IMAGES, InvalidMessageError("cameras", text))
-            return
-        self._stamps[key], self._keys[stamp] = stamp, key
-        self._use(stamp, image, camera, key[1])
 
 
 class MapOutput:
@@ -312,12 +238,12 @@ class SfmNode(Node):
         board = str(self.declare_parameter("board", "").value)
         self._arguments = config, load_board_file(board) if board else BoardFile()
         self._colmap = str(self.declare_parameter("colmap", "").value)
-        lockstep = bool(self.declare_parameter("lockstep", False).value)
-        # A replay that loses its reconstruction ends; on the robot it is begun anew.
-        self._supervisor = Supervisor(self._start_worker, None if lockstep else Journal())
+        self._lockstep = bool(self.declare_parameter("lockstep", False).value)
+        self._supervision = Supervision(self._start_worker, "the reconstruction process")
+        self._done = self._dropped = self._retired = 0  # keyframes answered, keyframes left out, Retires answered
         self._output = MapOutput(self)
         self._intake = Intake(self)
-        self._motion = MotionInput(self._intake, reliable=lockstep)
+        self._motion = MotionInput(self._intake, reliable=self._lockstep)
         self._keyframes = KeyframeInput(self._intake, self._on_keyframe)
         self._status = Status()
         self._motion_published = 0  # messages of motion that the last status counts
@@ -334,19 +260,23 @@ class SfmNode(Node):
         # Wall time: the status must follow while a paused recording stops ROS time.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._status_timer = self.create_timer(STATUS_PERIOD, self._publish_new_motion, clock=steady)
+        self._waking = self.create_timer(WAKE_PERIOD, self._supervision.wake, clock=steady)
 
     def destroy_node(self) -> None:
         """Ends the worker with the node."""
-        self._supervisor.close()
+        self._supervision.close()
         super().destroy_node()
 
     def _on_keyframe(self, stamp: int, encoded: bytes, camera: Camera, frame_id: str) -> None:
         self._seen += 1
         self._last_stamp = max(self._last_stamp, stamp)
-        if self._supervisor.is_full:
-            self._supervisor.dropped += 1
+        keyframe = AddKeyframe(stamp, encoded, camera, frame_id)
+        if self._supervision.is_poison(keyframe):
+            self._leave_out(keyframe)
+        elif self._supervision.backlog >= MAX_BACKLOG:
+            self._dropped += 1
         else:
-            self._supervisor.send(AddKeyframe(stamp, encoded, camera, frame_id, self._motion.take()))
+            self._supervision.send(replace(keyframe, motion=self._motion.take()))
         self._retire_when_due()
         self._finish_when_complete()
 
@@ -363,7 +293,7 @@ class SfmNode(Node):
         for retirement in [each for each in self._retirements if self._seen >= each.keyframes_published]:
             self._retirements.remove(retirement)
             self._retiring.append(retirement)
-            self._supervisor.send(Retire(retirement.stamps))
+            self._supervision.send(Retire(retirement.stamps))
 
     async def _on_finish(self, request: srv.Finish.Request, response: srv.Finish.Response) -> srv.Finish.Response:
         done: Future = Future()
@@ -379,41 +309,66 @@ class SfmNode(Node):
     def _finish_when_complete(self) -> None:
         if self._finish is not None and not self._finish_sent and self._seen >= self._finish[0]:
             self._finish_sent = True
-            self._supervisor.finish(Finish(self._motion.take(), self._colmap))
+            if self._supervision.problem:
+                self._answer_finish(self._supervision.problem)
+            else:
+                self._supervision.request(Finish(self._motion.take(), self._colmap))
+
+    def _answer_finish(self, problem: str) -> None:
+        if self._finish is not None:
+            self._finish[1].set_result(problem)
+            self._finish = None
 
     def _start_worker(self, answered: Iterable[AddKeyframe | Retire]) -> WorkerProcess:
         return WorkerProcess(self, serve, (*self._arguments, answered), self._on_event, self._on_death)
 
     def _on_event(self, event: Event) -> None:
-        self._supervisor.note(event)
         if isinstance(event, Ready):
+            self._supervision.ready()
             return
         self._status = event.status
         if isinstance(event, KeyframeDone):
-            self._publish_overlap(event, messages.header(event.stamp, self._keyframes.frame_id(event.stamp)))
+            self._supervision.answered()
+            self._done += 1
+            self._publish_overlap(event.overlaps, messages.header(event.stamp, self._keyframes.frame_id(event.stamp)))
             if event.trajectory is not None:
                 self._output.publish_poses(event.trajectory)
         elif isinstance(event, Retired):
-            retirement = self._retiring.popleft()
-            self._keyframes.forget(retirement.stamps)
-            self._publish_overlap(event, messages.header(retirement.stamp, retirement.frame_id))
+            self._supervision.answered()
+            self._end_retirement(event.overlaps)
         elif isinstance(event, MapReady):
             self._output.publish_map(event.map)
         self._publish_status()
-        if isinstance(event, Finished) and self._finish is not None:
-            self._finish[1].set_result(event.problem)
-            self._finish = None
+        if isinstance(event, Finished):
+            self._supervision.fulfilled()
+            self._answer_finish(event.problem)
 
     def _on_death(self, exit_code: int) -> None:
-        try:
-            self.get_logger().error(self._supervisor.restart(exit_code))
-        except ReconstructionLostError as error:
-            self.get_logger().fatal(str(error))
-            raise SystemExit(1) from None
+        death = self._supervision.restart(exit_code)
+        if self._lockstep and self._supervision.problem:  # a replay would wait for ever
+            self.get_logger().fatal(f"{death.report}: the map is lost")
+            raise SystemExit(1)
+        self.get_logger().error(death.report)
+        if isinstance(death.dropped, AddKeyframe):
+            self._leave_out(death.dropped)
+        elif isinstance(death.dropped, Retire):
+            self._end_retirement(())
+        if death.failed is not None:
+            self._answer_finish(death.report)
 
-    def _publish_overlap(self, event: KeyframeDone | Retired, header: Header) -> None:
-        keyframes, retired = self._supervisor.done + self._supervisor.dropped, self._supervisor.retired
-        self._output.publish_overlap(header, event.overlaps, keyframes, retired)
+    def _leave_out(self, keyframe: AddKeyframe) -> None:
+        """Counts a keyframe of which the reconstruction dies as answered, so that nobody waits for it."""
+        self._dropped += 1
+        self._publish_overlap((), messages.header(keyframe.stamp, keyframe.frame))
+
+    def _end_retirement(self, reports: Sequence[OverlapReport]) -> None:
+        self._retired += 1
+        retirement = self._retiring.popleft()
+        self._keyframes.forget(retirement.stamps)
+        self._publish_overlap(reports, messages.header(retirement.stamp, retirement.frame_id))
+
+    def _publish_overlap(self, reports: Sequence[OverlapReport], header: Header) -> None:
+        self._output.publish_overlap(header, reports, self._done + self._dropped, self._retired)
 
     def _publish_new_motion(self) -> None:
         if self._motion_published < self._motion.considered:
@@ -424,15 +379,17 @@ class SfmNode(Node):
         self._output.publish_status(self._status, self._last_stamp, self._motion_published)
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
-        status, dropped = self._status, self._supervisor.dropped
-        values: dict[str, Any] = {"keyframes": self._seen, "waiting": self._supervisor.backlog, "dropped": dropped}
-        values |= {"motion": self._motion.considered} | self._intake.health()
+        status, dropped = self._status, self._dropped
+        values: dict[str, Any] = {"keyframes": self._seen, "waiting": self._supervision.backlog, "dropped": dropped}
+        values |= {"motion": self._motion.considered} | self._intake.health() | self._supervision.health()
+        if self._supervision.problem:
+            return DiagnosticStatus.ERROR, self._supervision.problem, values
         refused = "messages that cannot be used were dropped: the values say of which kind" * bool(
             self._intake.rejected
         )
         level = DiagnosticStatus.WARN if refused else DiagnosticStatus.OK
         if status == Status():
-            return level, refused or ("waiting for keyframes" if self._supervisor.ready else "starting"), values
+            return level, refused or ("waiting for keyframes" if self._supervision.is_ready else "starting"), values
         values |= {
             "registered": status.registered,
             "models": status.models,

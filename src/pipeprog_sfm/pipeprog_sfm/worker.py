@@ -40,12 +40,18 @@ class AddKeyframe:
     frame: str = ""
     motion: RobotMotion = field(default_factory=RobotMotion)
 
+    @property
+    def content(self) -> tuple[bytes, Camera]:
+        """What is recognised when it comes again, under another stamp, too."""
+        return self.encoded, self.camera
+
 
 @dataclass(frozen=True)
 class Retire:
     """Command: take these keyframes out of the map."""
 
     stamps: tuple[int, ...]
+    content: None = None  # nothing of it is to be recognised when it comes again, as of Finish
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,7 @@ class Finish:
 
     motion: RobotMotion = field(default_factory=RobotMotion)
     colmap: str = ""
+    content: None = None
 
 
 @dataclass(frozen=True)

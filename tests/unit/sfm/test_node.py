@@ -18,10 +18,11 @@ from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.limits import MAX_CAMERAS, MAX_UNPAIRED
-from pipeprog_node import messages
+from pipeprog_node import keyframe_input, messages
 from pipeprog_node.intake import Intake
+from pipeprog_node.keyframe_input import CALIBRATIONS, IMAGES, KeyframeInput
 from pipeprog_sfm import node as sfm
-from pipeprog_sfm.node import CALIBRATIONS, IMAGES, KeyframeInput, MotionInput
+from pipeprog_sfm.node import MotionInput
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 ENCODED = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
@@ -152,7 +153,7 @@ def test_what_is_never_paired_is_bounded(keyframes: Keyframes) -> None:
 def test_images_that_are_never_paired_are_bounded_in_bytes(
     keyframes: Keyframes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sfm, "MAX_ENCODED_IMAGE", 2 * len(ENCODED))
+    monkeypatch.setattr(keyframe_input, "MAX_ENCODED_IMAGE", 2 * len(ENCODED))
     for stamp in range(4):
         keyframes.image(stamp)
     assert keyframes.intake.health() == {f"dropped on {IMAGES}: unpaired": 2}
