@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
@@ -37,7 +38,18 @@ BOARD_SEEN = slice(3, 19)  # frames from the first that shows the whole board
 NO_BOARD_SEEN = slice(16, 24)
 COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # the graph is tested here, not its accuracy
 TIMEOUT = 120.0  # s, for whatever takes seconds on an idle machine
+DISTURBED = 77  # ROS domain in which a foreign node publishes
+LOOPBACK = "0100007F"  # 127.0.0.1 in /proc/net
 MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"}
+
+
+def wait_for(
+    condition: Callable[[], object], pause: Callable[[float], object] = time.sleep, seconds: float = TIMEOUT
+) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        pause(0.05)
 
 
 def cut(path: Path, part: slice) -> Path:
@@ -48,26 +60,83 @@ def cut(path: Path, part: slice) -> Path:
     return path
 
 
-def start_replay(bag: Path, out: Path, *options: str) -> subprocess.Popen[str]:
-    """The installed command; without ROS_DOMAIN_ID it takes a domain of its own, so that two can run at a time."""
+def start_replay(bag: Path, out: Path, *options: str, domain: int = 0) -> subprocess.Popen[str]:
+    """The installed command; its user has set ROS_DOMAIN_ID."""
     settings = [word for name, value in COARSE.items() for word in ("--set", f"sfm.{name}={value}")]
     return subprocess.Popen(
         [Path(sys.executable).parent / "pipeprog", "replay", bag, "--boq", BOQ, "--out", out, *settings, *options],
-        env={name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"},
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
 
 
+@contextlib.contextmanager
+def foreign_node(domain: int, found: Path) -> Iterator[None]:
+    """A node that disturbs whatever it reaches on this machine in a domain; `found` gets the names that it sees."""
+    private = ("FASTRTPS_DEFAULT_PROFILES_FILE", "SKIP_DEFAULT_XML_FILE")
+    environment = {name: value for name, value in os.environ.items() if name not in private}
+    environment |= {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(BAGS.parent), os.environ.get("PYTHONPATH", "")]))
+    process = subprocess.Popen([sys.executable, "-m", "tests.integration.foreign_node", found], env=environment)
+    try:
+        wait_for(found.exists)
+        yield
+        assert process.poll() is None
+    finally:
+        process.kill()
+        process.wait()
+
+
+def addresses_until_end(process: subprocess.Popen[str]) -> dict[int, set[str]]:
+    """The addresses of all Internet sockets of a process and its descendants, looked at every second until it ends."""
+    seen: dict[int, set[str]] = defaultdict(set)
+
+    def has_ended() -> bool:
+        address_of = local_addresses()
+        for pid in descendants(process.pid):
+            with contextlib.suppress(OSError):  # it has just ended
+                files = [os.readlink(file) for file in Path(f"/proc/{pid}/fd").iterdir()]
+                seen[pid] |= {address_of[file] for file in files if file in address_of}
+        return process.poll() is not None
+
+    wait_for(has_ended, lambda _: time.sleep(1.0), 2 * TIMEOUT)  # two replays share the machine
+    return seen
+
+
+def local_addresses() -> dict[str, str]:
+    """Addresses of all Internet sockets of this machine, in hex as in /proc/net, by their names in /proc/<pid>/fd."""
+    rows = [
+        line.split()
+        for protocol in ("udp", "udp6", "tcp", "tcp6", "raw", "raw6")
+        for line in Path("/proc/net", protocol).read_text().splitlines()[1:]
+    ]
+    return {f"socket:[{row[9]}]": row[1].partition(":")[0] for row in rows}
+
+
+def descendants(pid: int) -> list[int]:
+    """The process and all that come from it."""
+    try:
+        return [pid, *(one for child in children(pid) for one in descendants(child))]
+    except FileNotFoundError:  # it has just ended
+        return []
+
+
 def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> None:
     bag = cut(tmp_path / "cut.mcap", BOARD_SEEN)
-    replays = [start_replay(bag, tmp_path / name, "--board", str(BOARD)) for name in ("one", "two")]
-    for replay in replays:
-        _, errors = replay.communicate(timeout=TIMEOUT)
-        assert replay.returncode == 0, errors
     one, two = tmp_path / "one", tmp_path / "two"
-    for name in ("pipes.json", "cloud.ply"):
+    with foreign_node(DISTURBED, tmp_path / "found"):
+        alone = start_replay(bag, one, "--board", str(BOARD))
+        disturbed = start_replay(bag, two, "--board", str(BOARD), domain=DISTURBED)
+        sockets = addresses_until_end(disturbed)
+        for replay in (alone, disturbed):
+            _, errors = replay.communicate(timeout=TIMEOUT)
+            assert replay.returncode == 0, errors
+    assert len([pid for pid, addresses in sockets.items() if addresses]) == 1 + len(MODULES)
+    assert set().union(*sockets.values()) == {LOOPBACK}
+    assert set((tmp_path / "found").read_text().split()) == set()
+    for name in ("pipes.json", "cloud.ply", "frames.csv"):
         assert (one / name).read_bytes() == (two / name).read_bytes(), name
 
     assert sorted(file.name for file in one.iterdir()) == [
@@ -131,11 +200,8 @@ class Robot:
         self.node.create_subscription(MarkerArray, "pipe_markers", self.markers.append, qos.latched())
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
-    def wait_for(self, condition: Callable[[], object], seconds: float = TIMEOUT) -> None:
-        deadline = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < deadline, "waited in vain"
-            self._executor.spin_once(timeout_sec=0.05)
+    def wait_for(self, condition: Callable[[], object]) -> None:
+        wait_for(condition, self._executor.spin_once)
 
     def is_connected(self) -> bool:
         count = self.node.count_subscribers

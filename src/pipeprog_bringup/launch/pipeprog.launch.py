@@ -59,6 +59,12 @@ ARGUMENTS = [
     ),
     DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
     DeclareLaunchArgument(
+        "enclaves",
+        default_value="/pipeprog",
+        description="Folder of the nodes' enclaves in the keystore of SROS2, such as /pipeprog/frames; without "
+        "ROS_SECURITY_ENABLE it has no effect.",
+    ),
+    DeclareLaunchArgument(
         "use_sim_time",
         default_value="false",
         choices=["true", "false"],
@@ -83,7 +89,10 @@ def pipeprog_node(name: str, parameters: dict, remappings: list) -> Node:
         namespace=LaunchConfiguration("namespace"),
         parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time, **parameters}],
         remappings=remappings,
-        ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+        ros_arguments=[
+            *("--log-level", LaunchConfiguration("log_level")),
+            *("--enclave", [LaunchConfiguration("enclaves"), "/", name]),
+        ],
         output="screen",
     )
 

@@ -15,7 +15,8 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph, NodeFailure, private_domain
+from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph, NodeFailure
+from pipeprog_bringup.playback.private_network import private_network
 from pipeprog_bringup.playback.session import Session, State
 from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, write_survey
 from pipeprog_bringup.recording.bag import Bag
@@ -78,7 +79,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
         parameters = _parameters(request, inputs.configs, folder.file("colmap"))
         session = Session(inputs.bag, request.rate, report)
-        with private_domain(scratch), Graph(parameters, scratch, modules) as graph, _ros():
+        with private_network(scratch), Graph(parameters, scratch, modules) as graph, _ros():
             survey, status = session.run(graph)
         with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
             record_survey(recording, survey, status)

@@ -7,14 +7,12 @@ import contextlib
 import ctypes
 import importlib
 import os
-import random
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -27,8 +25,6 @@ NODE_MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "d
 _STOP_SECONDS = 3.0
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None) if os.name == "posix" else None  # no graph runs elsewhere, but the command loads
-# Domain 101 would use ports from 7400 + 250 * 101 = 32650 on; Linux gives those from 32768 on to other programs.
-_DOMAINS = range(1, 101)
 
 
 class NodeFailure(Exception):
@@ -145,43 +141,3 @@ class Graph:
 def _die_with_parent() -> None:
     assert _LIBC is not None
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-@contextlib.contextmanager
-def private_domain(log_folder: Path) -> Iterator[None]:
-    """Set ROS to a domain of our own on the loopback interface, and its logs; what the user has set is kept."""
-    defaults = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(log_folder)}
-    chosen = {name: os.environ.get(name) or value for name, value in defaults.items()}
-    lock = None
-    if not os.environ.get("ROS_DOMAIN_ID"):
-        domain, lock = _free_domain()
-        chosen["ROS_DOMAIN_ID"] = str(domain)
-    before = {name: os.environ.get(name) for name in chosen}
-    os.environ.update(chosen)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        if lock is not None:
-            lock.close()
-
-
-def _free_domain() -> tuple[int, socket.socket]:
-    """A domain that no other replay on this machine holds, and that nobody listens in; with the lock that holds it."""
-    for domain in random.SystemRandom().sample(_DOMAINS, len(_DOMAINS)):
-        lock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        try:
-            # An abstract name: gone with the process, however that ends.
-            lock.bind(f"\0pipeprog-ros-domain-{domain}")
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                # Unicast discovery port of the first participant (RTPS 2.2, 9.6.1.1).
-                probe.bind(("", 7410 + 250 * domain))
-        except OSError:
-            lock.close()
-            continue
-        return domain, lock
-    raise NodeFailure("no free ROS domain from 1 to 100: set ROS_DOMAIN_ID")

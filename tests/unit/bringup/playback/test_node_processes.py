@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 
 import pytest
 
-from pipeprog_bringup.playback.node_processes import Graph, NodeFailure, private_domain
+from pipeprog_bringup.playback.node_processes import Graph, NodeFailure
 
 
 def wait_for_failure(graph: Graph) -> None:
@@ -25,20 +24,3 @@ def test_a_node_that_stops_by_itself_is_quoted(tmp_path: Path) -> None:
     assert "stopped with exit code 2" in str(caught.value)
     assert "json.tool: error: " in str(caught.value)
     assert str(tmp_path / "frames.log") in str(caught.value)
-
-
-def test_two_replays_have_domains_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
-    with private_domain(tmp_path):
-        first = os.environ.pop("ROS_DOMAIN_ID")
-        with private_domain(tmp_path):
-            assert os.environ["ROS_DOMAIN_ID"] != first
-            assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
-    assert "ROS_DOMAIN_ID" not in os.environ
-
-
-def test_a_domain_that_the_user_has_set_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
-    with private_domain(tmp_path):
-        assert os.environ["ROS_DOMAIN_ID"] == "42"
-    assert os.environ["ROS_DOMAIN_ID"] == "42"
