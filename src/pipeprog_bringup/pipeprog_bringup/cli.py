@@ -119,7 +119,7 @@ def detect(
     with share_bar("detect") as report:
         detection = detect_file(cloud, boq, out, [*cut, *(overrides or [])], force, report)
     if detection.dropped:
-        _note(f"{detection.dropped} points of {cloud} are not finite and were left out")
+        _note(f"{detection.dropped} points of {cloud} are not finite or beyond 1e8 m and were left out")
     print_progress(detection.product)
     typer.echo(f"{len(detection.product.pipes)} pipes in {detection.points} points: {out / 'pipes.json'}")
 
@@ -233,10 +233,12 @@ def main() -> None:
     """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
     from pipeprog_bringup.playback.node_processes import NodeFailure
     from pipeprog_camera.errors import InputError
+    from pipeprog_camera.user_folders import provide_user_folders
 
     # As for Ctrl-C, what was started is ended and what was half written is removed.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
+        provide_user_folders()
         code = app(prog_name="pipeprog", standalone_mode=False)
     except (InputError, NodeFailure) as error:
         _fail(str(error))
