@@ -56,7 +56,8 @@ FOLDERS = {
     },
     "pipeprog_bringup": {
         "recording": set(),
-        "results": set(),
+        "clouds": set(),
+        "results": {"clouds"},
         "report": {"results"},
         "view": {"report", "results"},
         "playback": {"recording", "results"},
@@ -81,6 +82,7 @@ DEPENDENCIES = {
     "yaml": "python3-yaml",
     "click": None,
     "laspy": None,
+    "lazrs": None,
     "lz4": None,
     "mcap": None,
     "mcap_ros2": None,
@@ -88,7 +90,7 @@ DEPENDENCIES = {
     "plyfile": None,
     "pye57": None,
     "pycolmap": None,
-    "pypcd4": None,
+    "lzf": None,
     "zstandard": None,
 }
 

@@ -28,6 +28,13 @@ MAX_POSES = 100_000  # keyframes; 14 hours at two a second
 MAX_OVERLAP = 1.001  # share of an image; areas of nearly equal hulls round to more than 1 in 32 bits
 MAX_COORDINATE = 1e8  # m; beyond the coordinates of any map projection (UTM: 1e7)
 
+# Files of clouds.
+MAX_CLOUD_POINTS_PER_BYTE = 8  # a bit a point: half a millimetre of noise alone takes 2 bits of each coordinate
+MAX_CLOUD_RECORDS = 1 << 31  # bytes that are unpacked at once; 32 for each point at MAX_CLOUD_POINTS
+MAX_CLOUD_HEADER = 1 << 16  # bytes; the headers of PLY and PCD have a line for each column and a few comments
+MAX_CLOUD_LINE = 1 << 16  # characters of a point in text; 1000 columns of a table
+MAX_CLOUD_DESCRIPTION = 1 << 26  # bytes of XML in an E57; 5 kB for each scan and picture: 10 000 of them
+
 # What a robot tells about its motion, and keyframes on their way to the reconstruction.
 MAX_QUATERNION_ERROR = 0.01  # of the norm: four components typed with two decimals are off by 0.005 each, 0.01 in all
 MAX_ACCELERATION = 1e4  # m/s^2; a thousand times gravity, beyond any accelerometer of a robot

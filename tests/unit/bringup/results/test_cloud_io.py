@@ -158,8 +158,8 @@ def test_clouds_without_use_are_errors(tmp_path: Path) -> None:
     cases = {
         "absent.ply": "no such cloud",
         "zero.ply": "is empty",
-        "text.ply": "cannot be read as .ply",
-        "cut.ply": "cannot be read as .ply",
+        "text.ply": "is no PLY",
+        "cut.ply": "cut off",
         "words.xyz": "no list of points",
         "broken.xyz": "cannot be read as .xyz",
         "cloud.obj": "no cloud format",
@@ -167,8 +167,8 @@ def test_clouds_without_use_are_errors(tmp_path: Path) -> None:
         "nan.ply": "none is finite",
         "whole.ply": "whole number",
         "coarse.ply": "32-bit floats",
-        "bad.las": "cannot be read as .las",
-        "bad.pcd": "cannot be read as .pcd",
+        "bad.las": "is no LAS",
+        "bad.pcd": "is no PCD",
     }
     for name, expected in cases.items():
         with pytest.raises(InputError, match=expected) as caught:
