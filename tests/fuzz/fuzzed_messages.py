@@ -13,8 +13,9 @@ import re
 import struct
 import zlib
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import cv2
@@ -132,13 +133,17 @@ def fuzzed_message(samples: Sequence[Any], rng: random.Random) -> Fuzzed:
     return Fuzzed(kind, _KINDS[kind](samples, rng))
 
 
-def fuzzed_messages(
-    topic: str, count: int, seed: int, samples: Mapping[str, Sequence[Any]] | None = None
-) -> list[Fuzzed]:
-    """`count` messages for a topic of `good_messages`, from these and from further `samples` by topic."""
+def fuzzed_stream(topic: str, seed: int, samples: Sequence[Any] = ()) -> Iterator[Fuzzed]:
+    """Messages without end for a topic of `good_messages`, from these and from further `samples`."""
     rng = random.Random(f"{topic} {seed}")
-    known = [good_messages(number)[topic] for number in range(4)] + list((samples or {}).get(topic, ()))
-    return [fuzzed_message(known, rng) for _ in range(count)]
+    known = [good_messages(number)[topic] for number in range(4)] + list(samples)
+    while True:
+        yield fuzzed_message(known, rng)
+
+
+def fuzzed_messages(topic: str, count: int, seed: int) -> list[Fuzzed]:
+    """The first `count` messages of that stream."""
+    return list(islice(fuzzed_stream(topic, seed), count))
 
 
 def _one_field(samples: Sequence[Any], rng: random.Random) -> Any:
