@@ -15,7 +15,7 @@ from pipeprog_bringup.recording.frame_check import Calibration, FrameCheck, Imag
 from pipeprog_bringup.recording.mcap_file import McapFile, Message
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import MAX_TRIED_IMAGES
+from pipeprog_camera.limits import MAX_CAMERAS, MAX_TRIED_IMAGES
 
 _IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
 TF, TF_STATIC = "/tf", "/tf_static"
@@ -167,8 +167,9 @@ def _choose(
     for flag, topic, known in (("--image-topic", image_topic, images), ("--camera-info-topic", info_topic, infos)):
         if topic is not None and topic not in known:
             raise InputError(f"{path}: {flag} {topic} is not among its topics: {_listed(known) or 'none of that type'}")
-    cameras = [topic for topic in images if not _is_depth(files, topic, types[topic])]
     if image_topic is None:
+        few = len(images) <= MAX_CAMERAS  # each is looked into; of more the error names some in any case
+        cameras = [topic for topic in images if not (few and _is_depth(files, topic, types[topic]))]
         # The same picture is often recorded raw and compressed; frames passes keyframes on compressed in any case.
         cameras = [
             topic for topic in cameras if types[topic] == cdr.COMPRESSED_IMAGE or f"{topic}/compressed" not in cameras

@@ -20,7 +20,7 @@ from mcap_ros2.writer import serialize_dynamic
 
 from pipeprog_bringup.recording.definitions import message_definition
 from pipeprog_camera.camera import Camera, check_whole_sensor
-from pipeprog_camera.limits import MAX_DISTORTION_COEFFICIENTS, MAX_NAME, MAX_SMALL_MESSAGE
+from pipeprog_camera.limits import MAX_DISTORTION_COEFFICIENTS, MAX_NAME, MAX_SECONDS, MAX_SMALL_MESSAGE
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -115,7 +115,7 @@ class _Reader:
 
     def header(self) -> tuple[int, str]:
         seconds, nanoseconds = self.number("i"), self.number("I")
-        if seconds < 0 or nanoseconds >= NANOSECONDS:
+        if not 0 <= seconds < MAX_SECONDS or nanoseconds >= NANOSECONDS:
             raise StampError(f"stamp is no time: {seconds} s + {nanoseconds} ns; the camera's driver must set it")
         return seconds * NANOSECONDS + nanoseconds, self.string()
 
@@ -125,7 +125,8 @@ def read_camera_info(data: bytes) -> CameraInfo:
     if len(data) > MAX_SMALL_MESSAGE:
         raise ValueError(f"{len(data)} bytes are no CameraInfo")
     reader = _Reader(data)
-    _, frame_id = reader.header()
+    reader.numbers("I", 2)  # the stamp; the image's own is used
+    frame_id = reader.string()
     height, width = reader.numbers("I", 2)
     model = reader.string()
     coefficients = reader.number("I")

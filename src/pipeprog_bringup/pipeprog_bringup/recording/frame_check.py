@@ -11,7 +11,7 @@ import functools
 from dataclasses import dataclass
 
 from pipeprog_bringup.recording import cdr
-from pipeprog_camera.encoded_image import check_size, encoded_size
+from pipeprog_camera.encoded_image import check_bytes, check_size, encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CHANNELS
 from pipeprog_camera.raw_image import check_layout
@@ -111,6 +111,7 @@ def image_size(image: cdr.ImageFields, type_name: str) -> tuple[int, int]:
     """(width, height) [px] that the image declares; raises InputError where it is none that can be used."""
     if type_name == cdr.COMPRESSED_IMAGE:
         return encoded_size(bytes(image.data))
+    check_bytes(len(image.data))
     check_size(image.width, image.height)
     check_layout(image.width, image.height, image.encoding, image.step, len(image.data))
     return image.width, image.height

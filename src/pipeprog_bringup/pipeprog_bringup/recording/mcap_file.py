@@ -109,6 +109,7 @@ class McapFile:
                     block.counts = Counter(message[1] for message in file._read(stream, block, allowance))
         for block in file._blocks:
             file.counts.update(block.counts)
+        file._blocks.sort(key=lambda block: (block.start, block.offset))
         return file
 
     @property
@@ -132,7 +133,7 @@ class McapFile:
             return Message(log_time, channel_id, _plain(data, allowance))
 
         with self.path.open("rb") as stream:
-            for block in sorted(self._blocks, key=lambda block: (block.start, block.offset)):
+            for block in self._blocks:
                 if not channel_ids & set(block.counts):
                     continue
                 while waiting and waiting[0][0] < block.start:
