@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.camera import Camera
+from pipeprog_sfm.boards.conic import pixel_change
 
 MIN_CIRCLES = 3  # circles that identify a board and fix its pose; two agree with a wrong pose by chance
 LAYOUT_TOLERANCE = (
@@ -68,6 +70,19 @@ class BoardObservation:
     conics: FloatArray
     sigma: float
     camera_from_board: FloatArray
+
+    def in_pixels_of(self, camera: Camera, own: Camera) -> BoardObservation:
+        """The same in the pixels of another camera than its own, at the same place."""
+        stretch, shift = pixel_change(camera, own)
+        back = own.matrix @ np.linalg.inv(camera.matrix)
+        conics = back.T @ self.conics @ back
+        return replace(
+            self,
+            centres=self.centres * stretch + shift,
+            ellipse_centres=self.ellipse_centres * stretch + shift,
+            conics=conics / np.linalg.norm(conics, axis=(-2, -1), keepdims=True),
+            sigma=self.sigma * float(np.sqrt(stretch.prod())),
+        )
 
 
 def symmetries(board: Board) -> NDArray[np.intp]:

@@ -11,6 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.camera import Camera
+
+
+def pixel_change(camera: Camera, own: Camera) -> tuple[FloatArray, FloatArray]:
+    """(2,) factors and (2,) shifts from the pixels of the ideal camera `own` to those of `camera` at its place."""
+    stretch = np.array([camera.fx / own.fx, camera.fy / own.fy])
+    return stretch, np.array([camera.cx, camera.cy]) - stretch * [own.cx, own.cy]
 
 
 def conic_from_ellipse(centres: FloatArray, shapes: FloatArray) -> FloatArray:

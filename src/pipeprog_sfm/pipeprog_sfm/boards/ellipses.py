@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.boards.conic import axes_and_angle, conic_from_ellipse
+from pipeprog_sfm.boards.conic import axes_and_angle, conic_from_ellipse, pixel_change
 from pipeprog_sfm.config import BoardConfig
 
 PROFILES = 64  # edge points of an ellipse: a coordinate of its centre has sqrt(2/64), a sixth, of their noise
@@ -44,6 +44,15 @@ class ImageEllipses:
 
     def __len__(self) -> int:
         return len(self.centres)
+
+    def in_pixels_of(self, camera: Camera, own: Camera) -> ImageEllipses:
+        """The same in the pixels of another camera than its own, at the same place."""
+        stretch, shift = pixel_change(camera, own)
+        return ImageEllipses(
+            self.centres * stretch + shift,
+            self.shapes * np.outer(stretch, stretch),
+            self.rms * float(np.sqrt(stretch.prod())),
+        )
 
     @property
     def conics(self) -> FloatArray:

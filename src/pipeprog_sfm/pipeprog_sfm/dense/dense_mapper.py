@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,7 +19,14 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
-from pipeprog_sfm.dense.stereo import DepthMap, StereoImage, choose_pairs, depth_map, working_image
+from pipeprog_sfm.dense.stereo import (
+    DepthMap,
+    StereoImage,
+    choose_pairs,
+    depth_map,
+    working_image,
+    working_size,
+)
 from pipeprog_sfm.types import EncodedImage
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
@@ -126,12 +133,16 @@ class DenseMapper:
             return
         sample = points[:: max(len(points) // SAMPLE, 1)]
         mapped = [other for other in self._depths if other in poses]
-        seen = overlap(sample, pose, [poses[other] for other in mapped], images[stamp].camera)
+        seen = overlap(sample, pose, [(poses[other], images[other].camera) for other in mapped])
         if len(seen) and seen.max() > self._overlap:
             self._covered[stamp] = mapped[int(seen.argmax())]
             return
         near, middle, far = np.percentile(depth, [1, 50, 99])
-        pairs = choose_pairs(stamp, poses, float(middle), self._stereo_config)
+        # The sweep compares images of one size; a camera that switches its resolution has neighbours on either side.
+        width = self._stereo_config.width
+        size = working_size(images[stamp].camera, width)
+        alike = {other: one for other, one in poses.items() if working_size(images[other].camera, width) == size}
+        pairs = choose_pairs(stamp, alike, float(middle), self._stereo_config)
         if not pairs:
             self._refused[stamp] = len(poses)
             return
@@ -189,22 +200,29 @@ class DenseMapper:
         return self._fusion.cloud()
 
 
-def overlap(points: FloatArray, camera_from_model: FloatArray, others: list[FloatArray], camera: Camera) -> FloatArray:
-    """(V,) share of the (K, 3) points of one view that each of the others sees from the same side and distance."""
+def overlap(
+    points: FloatArray, camera_from_model: FloatArray, others: Sequence[tuple[FloatArray, Camera]]
+) -> FloatArray:
+    """(V,) share of the (K, 3) points of one view that each of the others sees from the same side and distance.
+
+    others: (4, 4) camera_from_model and calibration of each.
+    """
     if not others:
         return np.zeros(0)
-    poses = np.stack([camera_from_model, *others])
+    poses = np.stack([camera_from_model, *(pose for pose, _ in others)])
     inside = np.einsum("vij,kj->vki", poses[:, :3, :3], points) + poses[:, None, :3, 3]
     depth = inside[..., 2]
+    cameras = [(each.fx, each.fy, each.cx, each.cy, each.width, each.height) for _, each in others]
+    fx, fy, cx, cy, width, height = np.array(cameras, float).T[..., None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        u = inside[..., 0] / depth * camera.fx + camera.cx
-        v = inside[..., 1] / depth * camera.fy + camera.cy
+        u = inside[1:, :, 0] / depth[1:] * fx + cx
+        v = inside[1:, :, 1] / depth[1:] * fy + cy
     rays = points - -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])[:, None]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    seen = (depth > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    seen &= np.einsum("vki,ki->vk", rays, rays[0]) > np.cos(SAME_SIDE)
-    seen &= depth < SAME_SCALE * depth[0]
-    return seen[1:].mean(axis=1)
+    seen = (depth[1:] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    seen &= (np.einsum("vki,ki->vk", rays, rays[0]) > np.cos(SAME_SIDE))[1:]
+    seen &= depth[1:] < SAME_SCALE * depth[0]
+    return seen.mean(axis=1)
 
 
 def distance(camera_from_world: FloatArray, other_from_world: FloatArray) -> float:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +57,7 @@ class Fusion:
             return
         depth, normal, agreeing = _confirm(
             view.depth,
-            np.stack([other.depth for other in neighbours]),
+            _stacked([other.depth for other in neighbours]),
             view.matrix,
             np.stack([other.matrix for other in neighbours]),
             np.stack([other.camera_from_map @ np.linalg.inv(view.camera_from_map) for other in neighbours]),
@@ -100,6 +101,16 @@ class Fusion:
                 shares.append((-inside.mean(), index))
         best = sorted(index for _, index in sorted(shares)[: self._config.max_neighbours])
         return [self._views[index] for index in best]
+
+
+def _stacked(depths: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """(N, h, w) of depth maps; where a camera has switched its size, the smaller ones are unknown (NaN) outside."""
+    if all(depth.shape == depths[0].shape for depth in depths):
+        return np.stack(depths)
+    stack = np.full((len(depths), *np.max([depth.shape for depth in depths], axis=0)), np.nan, np.float32)
+    for layer, depth in zip(stack, depths, strict=True):
+        layer[: depth.shape[0], : depth.shape[1]] = depth
+    return stack
 
 
 class _VoxelHash:

@@ -155,3 +155,9 @@ def working_image(image: ByteImage, camera: Camera, width: int) -> tuple[ByteIma
         return image, camera
     camera = camera.scaled(factor)
     return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera
+
+
+def working_size(camera: Camera, width: int) -> tuple[int, int]:
+    """(width, height) of a camera's working image."""
+    factor = min(width / camera.width, 1.0)
+    return round(camera.width * factor), round(camera.height * factor)

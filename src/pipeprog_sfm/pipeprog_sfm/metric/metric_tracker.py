@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -43,7 +44,7 @@ class MetricTracker:
         self._config = config
         self._odometry = odometry
         self._sources = sources
-        self._camera: Camera | None = None
+        self._cameras: dict[int, Camera] = {}  # of the keyframes of `_frame`
         self._frame: str | None = None
         self._frames: dict[int, str] = {}
         self._ellipses: dict[int, ImageEllipses] = {}
@@ -57,7 +58,7 @@ class MetricTracker:
         Args:
             stamp: time of the keyframe [ns].
             gray: (H, W) uint8 image as the camera saw it: edges are measured before the lens distortion is removed.
-            camera: calibration, the same for every keyframe of one frame.
+            camera: calibration.
             frame: name of the camera's optical frame; boards are measured with the first camera alone.
         """
         self._frames[stamp] = frame
@@ -65,7 +66,7 @@ class MetricTracker:
             self._frame = frame
         if frame != self._frame:
             return []
-        self._camera = camera
+        self._cameras[stamp] = camera
         ellipses = detect_ellipses(gray, camera, self._config)
         found = detect_boards(ellipses, self._board_file.boards, camera)
         if len(ellipses):
@@ -85,6 +86,7 @@ class MetricTracker:
             self._ellipses.pop(stamp, None)
             self._observations.pop(stamp, None)
             self._frames.pop(stamp, None)
+            self._cameras.pop(stamp, None)
 
     def estimate(
         self,
@@ -102,16 +104,32 @@ class MetricTracker:
         Raises:
             NoScaleError: as `estimate_scale`.
         """
-        if self._camera is None or self._frame is None:
+        if not self._cameras or self._frame is None:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
+        camera = self._usual_camera()
+        other = {stamp: own for stamp, own in self._cameras.items() if own != camera}
         seen = ScaleEvidence(
             self._board_file,
-            self._observations,
-            self._ellipses,
+            {
+                stamp: [one.in_pixels_of(camera, other[stamp]) for one in found] if stamp in other else found
+                for stamp, found in self._observations.items()
+            },
+            {
+                stamp: found.in_pixels_of(camera, other[stamp]) if stamp in other else found
+                for stamp, found in self._ellipses.items()
+            },
             self._transforms,
             self._accelerations,
             self._frame,
             self._frames,
         )
-        posed = PosedEvidence(seen, poses, self._camera, self._config, self._odometry, points)
+        posed = PosedEvidence(seen, poses, camera, self._config, self._odometry, points)
         return estimate_scale(posed, covariance, self._sources)
+
+    def _usual_camera(self) -> Camera:
+        """The calibration of most keyframes: a camera may switch its resolution, and all is measured in pixels of one.
+
+        Noise is taken to be the same number of these pixels in every image: right for most of them, and a single
+        keyframe of another resolution does not change the unit.
+        """
+        return Counter(self._cameras.values()).most_common(1)[0][0]

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipeprog_camera.camera import Camera
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray, match_guided
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -38,7 +37,7 @@ def link(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> No
     near, far = np.percentile(depth, DEPTH_PERCENTILES)
     depth_range = float(near / DEPTH_MARGIN), float(DEPTH_MARGIN * far)
     features, others = [], []
-    for other in partners(model, view, keyframes[model.stamps[view]].camera):
+    for other in partners(model, view, keyframes):
         found = _match_guided(model, view, other, keyframes, depth_range)
         features.append(found[:, 0] + model.offsets[view])
         others.append(found[:, 1] + model.offsets[other])
@@ -49,10 +48,10 @@ def link(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> No
     model.link(feature[order], other_feature[order])
 
 
-def partners(model: SparseModel, view: int, camera: Camera) -> list[int]:
+def partners(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> list[int]:
     """Neighbours in time, then the views that see most of the view's points from a similar direction and distance.
 
-    camera: of the view; the others are assumed to have the same.
+    keyframes: at least those of the model's views, by stamp.
     """
     gap = np.abs(np.array(model.stamps) - model.stamps[view])
     gap[view] = np.iinfo(np.int64).max
@@ -64,8 +63,9 @@ def partners(model: SparseModel, view: int, camera: Camera) -> list[int]:
     depth = inside[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = inside[:, 0] / depth, inside[:, 1] / depth
-    visible = (depth > 0) & (np.abs(u) < 0.5 * camera.width / camera.fx)
-    visible &= np.abs(v) < 0.5 * camera.height / camera.fy
+    cameras = [keyframes[stamp].camera for stamp in model.stamps]
+    reach = np.array([(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy) for camera in cameras])
+    visible = (depth > 0) & (np.abs(u) < reach[:, :1]) & (np.abs(v) < reach[:, 1:])
     own = depth[view]
     visible &= (depth < MAX_SCALE * own) & (MAX_SCALE * depth > own)
     similar = model.rotation[:, 2] @ model.rotation[view, 2] > np.cos(MAX_ANGLE)

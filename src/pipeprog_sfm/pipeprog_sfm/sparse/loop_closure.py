@@ -36,7 +36,7 @@ def close_loop(sparse_map: SparseMap, localizer: Localizer, stamp: int) -> None:
     if not len(candidates):
         return
     keyframe = sparse_map.keyframes[stamp]
-    near = np.intersect1d(np.array(partners(model, view, keyframe.camera), np.int64), candidates)
+    near = np.intersect1d(np.array(partners(model, view, sparse_map.keyframes), np.int64), candidates)
     views = np.union1d(near, candidates[localizer.next_subset(len(candidates))])
     similar = localizer.similar_views(model, keyframe, views, PREVIEW_MATCHES)
     if not len(similar):

@@ -104,10 +104,10 @@ def test_overlap_is_the_share_seen_from_the_same_side() -> None:
     turned[:3, :3] = cv2.Rodrigues(np.array([0.0, np.pi, 0.0]))[0]
     nearer = pose(4)
     nearer[2, 3] = 0.5  # farther away: all of it, but smaller
-    share = overlap(points, pose(4), [pose(4), pose(5), pose(12), turned, nearer], CAMERA)
+    share = overlap(points, pose(4), [(other, CAMERA) for other in (pose(4), pose(5), pose(12), turned, nearer)])
     assert share[0] == 1.0
     assert share[1] == pytest.approx(1 - STEP / WIDTH, abs=0.03)
     assert share[2] == 0.0  # 31 degrees round
     assert share[3] == 0.0
     assert share[4] < 1.0
-    assert len(overlap(points, pose(4), [], CAMERA)) == 0
+    assert len(overlap(points, pose(4), [])) == 0
