@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry, Path
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import Imu, PointCloud2
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -25,9 +23,10 @@ from pipeprog_camera.limits import (
     MAX_TRANSFORM_FRAMES,
     MAX_WAITING_MOTION,
 )
-from pipeprog_msgs import msg, srv
+from pipeprog_msgs import msg
 from pipeprog_node import messages, qos, received
 from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import KeyframeInput
 from pipeprog_node.main import run
@@ -250,12 +249,10 @@ class SfmNode(Node):
         self._retirements: list[ReceivedRetirement] = []  # to be applied after the keyframes before them
         self._retiring: deque[ReceivedRetirement] = deque()  # at the worker
         self._seen = self._last_stamp = 0
-        self._finish: tuple[int, Future] | None = None
         self._finish_sent = False
         depth = qos.reliable(MAX_BACKLOG)
         self._intake.subscribe(msg.KeyframesRetired, RETIRED, received.retirement, self._on_retired, depth)
-        # In a group of its own: while it waits for the end, the other callbacks must run.
-        self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
+        self._finish = FinishService(self, lambda: self._seen, self._begin_finish)
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
         # Wall time: the status must follow while a paused recording stops ROS time.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -295,29 +292,17 @@ class SfmNode(Node):
             self._retiring.append(retirement)
             self._supervision.send(Retire(retirement.stamps))
 
-    async def _on_finish(self, request: srv.Finish.Request, response: srv.Finish.Response) -> srv.Finish.Response:
-        done: Future = Future()
-        self._finish = (request.expected_inputs, done)
+    def _begin_finish(self) -> None:
         self._finish_sent = False
         self._finish_when_complete()
-        problem = await done
-        response.success = not problem
-        response.message = problem
-        response.outputs = self._output.revision
-        return response
 
     def _finish_when_complete(self) -> None:
-        if self._finish is not None and not self._finish_sent and self._seen >= self._finish[0]:
+        if self._finish.is_due and not self._finish_sent:
             self._finish_sent = True
             if self._supervision.problem:
-                self._answer_finish(self._supervision.problem)
+                self._finish.answer(self._output.revision, self._supervision.problem)
             else:
                 self._supervision.request(Finish(self._motion.take(), self._colmap))
-
-    def _answer_finish(self, problem: str) -> None:
-        if self._finish is not None:
-            self._finish[1].set_result(problem)
-            self._finish = None
 
     def _start_worker(self, answered: Iterable[AddKeyframe | Retire]) -> WorkerProcess:
         return WorkerProcess(self, serve, (*self._arguments, answered), self._on_event, self._on_death)
@@ -341,7 +326,7 @@ class SfmNode(Node):
         self._publish_status()
         if isinstance(event, Finished):
             self._supervision.fulfilled()
-            self._answer_finish(event.problem)
+            self._finish.answer(self._output.revision, event.problem)
 
     def _on_death(self, exit_code: int) -> None:
         death = self._supervision.restart(exit_code)
@@ -354,7 +339,7 @@ class SfmNode(Node):
         elif isinstance(death.dropped, Retire):
             self._end_retirement(())
         if death.failed is not None:
-            self._answer_finish(death.report)
+            self._finish.answer(self._output.revision, death.report)
 
     def _leave_out(self, keyframe: AddKeyframe) -> None:
         """Counts a keyframe of which the reconstruction dies as answered, so that nobody waits for it."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
@@ -99,7 +100,10 @@ class Reconstruction:
         self._problem = ""
 
     def add(self, stamp: int, encoded: bytes, camera: Camera, frame: str = "") -> KeyframeReport:
-        """Takes a keyframe (JPEG or PNG bytes, stamp in ns, the camera's frame); InputError when it is damaged."""
+        """Takes a keyframe (JPEG or PNG bytes, stamp in ns, the camera's frame); InputError when it cannot be used."""
+        if stamp in self._map.keyframes:
+            raise InputError("a keyframe of this stamp has been taken already: it is left out")
+        encoded_size(encoded)  # before it is decoded
         gray = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
         if gray is None:
             raise InputError("the image is damaged: it is left out")

@@ -239,6 +239,8 @@ def _matched_circles(
 ) -> BoardFit:
     """The pose with the circles that have a free ellipse within `gate` radii of their predicted centre, one to one."""
     centres, shapes = project_circles(matrix, pose, board.centres, board.circle_radius)
+    if not np.isfinite(shapes).all():  # the camera is in the plane of the board
+        return BoardFit(pose, np.empty(0, np.intp), np.empty(0, np.intp))
     predicted = np.sqrt(np.maximum(np.linalg.eigvalsh(shapes), 1e-12))
     measured = np.sqrt(np.maximum(np.linalg.eigvalsh(ellipses.shapes), 1e-12))
     gaps = np.linalg.norm(centres[:, None] - ellipses.centres[None], axis=-1) / predicted[:, None, 1]

@@ -96,10 +96,14 @@ def circles_from_conics(conics: FloatArray, camera_matrix: FloatArray, radius: f
         radius: radius of the circles, which sets the unit of the result.
 
     Returns:
-        Centres (N, 2, 3) and unit normals (N, 2, 3) in the camera's frame; normals point towards the camera.
+        Centres (N, 2, 3) and unit normals (N, 2, 3) in the camera's frame; normals point towards the camera. NaN for
+        what is no ellipse.
     """
     cones = camera_matrix.T @ conics @ camera_matrix
     cones /= np.linalg.norm(cones, axis=(-2, -1), keepdims=True)
+    # Eigenvalues of what is not finite do not converge, and a pair of lines has no pole of a line: their circles are
+    # unknown, as are those of the cone that takes their place, which has no real point.
+    cones[~np.isfinite(cones).all((1, 2)) | (np.linalg.det(cones) == 0.0)] = np.eye(3)
     values, vectors = np.linalg.eigh(cones)
     flip = values[:, 1] < 0
     cones[flip] *= -1

@@ -88,8 +88,11 @@ def detect_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig
             break
         points, weights = _edge_points(gray, centres, shapes)
         undistorted = lens.undistort_points(points.reshape(-1, 2)).reshape(points.shape)
-        centres, shapes, rms, good = _fit(undistorted, weights)
-        good &= _plausible(shapes, config)
+        # Far outside of a lens's image circle its distortion has no inverse.
+        known = np.isfinite(undistorted).all(-1)
+        centres, shapes, rms, good = _fit(np.where(known[..., None], undistorted, 0.0), weights * known)
+        centres, shapes, rms = centres[good], shapes[good], rms[good]
+        good = _plausible(shapes, config)
         centres, shapes, rms = centres[good], shapes[good], rms[good]
     single = _first_of_each(centres, shapes, rms)
     return ImageEllipses(centres[single], shapes[single], rms[single])
@@ -212,7 +215,7 @@ def _fit(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArra
     shape = np.linalg.inv(quadratic) * level[:, None, None]
     centres = mean + np.einsum("eij,ej->ei", root, centre)
     shapes = root @ shape @ root.transpose(0, 2, 1)
-    return centres, shapes, rms, good
+    return centres, shapes, rms, good & np.isfinite(shapes).all((1, 2))
 
 
 def _plausible(shapes: FloatArray, config: BoardConfig) -> NDArray[np.bool_]:

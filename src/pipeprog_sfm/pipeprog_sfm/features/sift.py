@@ -50,7 +50,9 @@ def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Fe
     places = np.array([keypoint.pt for keypoint in kept], np.float32)
     pixels = (places + 0.5) / factor - 0.5
     keypoints = camera.undistort_points(pixels).astype(np.float32)
-    return Features(keypoints, root_sift(descriptors))
+    # Far outside of a lens's image circle its distortion has no inverse.
+    known = np.isfinite(keypoints).all(axis=1)
+    return Features(keypoints[known], root_sift(descriptors[known]))
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

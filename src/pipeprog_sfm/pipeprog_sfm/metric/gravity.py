@@ -47,6 +47,8 @@ def gravity(
     whole = float(seconds[-1])
     if whole < MIN_SECONDS or len(at) < MIN_SAMPLES or np.diff(np.r_[0.0, np.sort(at), whole]).max() > MAX_GAP * whole:
         raise GravityError("the accelerations of the IMU do not cover the keyframes: record them all the way")
+    if not (np.diff(seconds) > 0).all():
+        raise GravityError(f"keyframes are {whole:.0f} s apart, and others at one moment: check the camera's clock")
     stack = np.stack(list(poses.values()))
     model_from_camera = Slerp(seconds, Rotation.from_matrix(stack[:, :3, :3].transpose(0, 2, 1)))
     order = np.argsort(at, kind="stable")
@@ -59,7 +61,7 @@ def gravity(
     mean_place = (0.5 * (centres[1:] + centres[:-1]) * np.diff(seconds)[:, None]).sum(0) / whole
     up = felt - 12.0 / whole**2 * (0.5 * (centres[0] + centres[-1]) - mean_place)
     size = float(np.linalg.norm(up))
-    if abs(size - STANDARD_GRAVITY) > MAX_DEVIATION:
+    if not abs(size - STANDARD_GRAVITY) <= MAX_DEVIATION:
         raise GravityError(
             f"the IMU feels {size:.2f} m/s^2 on average, not {STANDARD_GRAVITY:.2f}: check its unit and its transform"
         )

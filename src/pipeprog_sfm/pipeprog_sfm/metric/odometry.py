@@ -16,6 +16,7 @@ from pipeprog_sfm.metric.transform_tree import CameraPath
 
 SEGMENTS = 20  # of the way: long against the jitter of single poses, and enough of them to reject outliers
 MIN_SEGMENTS = 4  # more than these, to estimate a standard deviation from their scatter
+MIN_WAY = 0.01  # m, of the whole way; less is the jitter of an odometry that stands still
 MAX_MISFIT = 0.3  # median error of a segment over its length; above, the transform or the clocks must be wrong
 ROUNDS = 20  # of reweighting, each of which at least halves the distance from the limit: to 1e-6 of it
 
@@ -90,7 +91,7 @@ def _median_scale(segments: _Segments) -> float:
     """Metres per model unit; raises OdometryError where odometry and camera did not move together."""
     moved, told = segments.moved, segments.told
     scale = float(np.median(np.linalg.norm(told, axis=1) / np.maximum(np.linalg.norm(moved, axis=1), 1e-12)))
-    if scale <= 0:
+    if scale * segments.length.sum() < MIN_WAY:
         raise OdometryError("odometry says that the camera stood still")
     misfit = np.linalg.norm(told - scale * moved, axis=1) / (scale * segments.length)
     if np.median(misfit) > MAX_MISFIT:

@@ -10,11 +10,14 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.arrays import FloatArray
 
 MAX_GAP = 500_000_000  # ns between two poses that are interpolated; one step of a walk takes as long
+MAX_SPEED = 30.0  # m/s; 108 km/h, faster than any robot that films pipes
+MAX_JITTER = 0.1  # m, of a step at any speed: noise, and stamps that come in bursts
+MAX_JUMPS = 0.01  # of the steps, and two in any case: one wrong pose, or a few corrections of a map, do no harm
 ODOMETRY_FRAME = "odom"  # REP 105: continuous, while the frames above it may jump
 
 
@@ -56,7 +59,7 @@ class CameraPath:
 
 
 class NoPathError(Exception):
-    """The transforms do not lead from one frame to another; the text says where they end."""
+    """The transforms do not lead from one frame to another, or jump; the text says where."""
 
 
 class TransformTree:
@@ -84,7 +87,7 @@ class TransformTree:
         The root is the odometry frame of REP 105 where there is one, since frames above it may jump.
 
         Raises:
-            NoPathError: nothing above the camera moves.
+            NoPathError: nothing above the camera moves, or what moves there jumps.
         """
         chain = [camera]
         while (parent := self._parent(chain[-1])) and parent not in chain:
@@ -137,10 +140,27 @@ class TransformTree:
         return max(sorted(parents), key=lambda parent: len(parents[parent]), default="")
 
 
+def _jumps(stamps: NDArray[np.int64], places: FloatArray) -> tuple[int, int]:
+    """How many steps between places (N, 3) at stamps (N,), ascending, are faster than a robot; and how many there are.
+
+    Two robots on one topic, or a wrong unit, jump all the time.
+    """
+    gaps = np.diff(stamps)
+    near = gaps <= MAX_GAP
+    lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)[near]
+    return int((lengths > MAX_JITTER + MAX_SPEED * 1e-9 * gaps[near]).sum()), int(near.sum())
+
+
 def _interpolated(samples: Sequence[Transform], times: NDArray[np.int64]) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Poses (M, 4, 4) at times (M,), and which of them (M,) have a sample close enough on both sides."""
     stamps, first = np.unique(np.array([sample.stamp for sample in samples], np.int64), return_index=True)
     stack = np.stack([samples[index].parent_from_child for index in first])
+    jumps, steps = _jumps(stamps, stack[:, :3, 3])
+    if jumps > max(MAX_JUMPS * steps, 2):
+        raise NoPathError(
+            f"{jumps} of {steps} steps of '{samples[0].child}' in '{samples[0].parent}' are faster than {MAX_SPEED:g} "
+            "m/s: check that odometry is in metres, and that one robot alone publishes it"
+        )
     after = np.clip(np.searchsorted(stamps, times), 0, len(stamps) - 1)
     before = np.where(stamps[after] > times, after - 1, after)
     known = (before >= 0) & (stamps[after] >= times)
@@ -149,12 +169,11 @@ def _interpolated(samples: Sequence[Transform], times: NDArray[np.int64]) -> tup
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     if not known.any():
         return poses, known
-    inside = np.clip(times, stamps[0], stamps[-1])
-    if len(stamps) == 1:
-        return np.repeat(stack, len(times), axis=0), known
-    seconds = (stamps - stamps[0]) * 1e-9
-    at = (inside - stamps[0]) * 1e-9
-    poses[:, :3, :3] = Slerp(seconds, Rotation.from_matrix(stack[:, :3, :3]))(at).as_matrix()
-    for axis in range(3):
-        poses[:, axis, 3] = np.interp(at, seconds, stack[:, axis, 3])
+    # Times since the sample before, exact to the nanosecond however far apart the first and the last sample are.
+    before, after = before[known], after[known]
+    share = (times[known] - stamps[before]) / np.maximum(stamps[after] - stamps[before], 1)
+    start, end = stack[before], stack[after]
+    turn = Rotation.from_matrix(start[:, :3, :3].transpose(0, 2, 1) @ end[:, :3, :3]).as_rotvec()
+    poses[known, :3, :3] = start[:, :3, :3] @ Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+    poses[known, :3, 3] = start[:, :3, 3] + share[:, None] * (end[:, :3, 3] - start[:, :3, 3])
     return poses, known

@@ -25,18 +25,21 @@ class VerticalSource(Protocol):
 
 def imu(posed: PosedEvidence, scale: float) -> list[Vertical | ScaleWarning]:
     """Up by gravity, from the accelerations of an IMU mounted beside the camera."""
-    samples = posed.seen.accelerations
+    found: list[Vertical | ScaleWarning] = []
+    camera_from_imu = {}
+    for frame in sorted({one.frame for one in posed.seen.accelerations}):
+        try:
+            camera_from_imu[frame] = posed.seen.transforms.static_transform(posed.seen.camera_frame, frame)
+        except NoPathError as error:
+            found.append(ScaleWarning(str(error)))
+    samples = [one for one in posed.seen.accelerations if one.frame in camera_from_imu]
     if not samples:
-        return []
+        return found
+    forces = np.stack([camera_from_imu[one.frame][:3, :3] @ one.force for one in samples])
     try:
-        camera_from_imu = {
-            frame: posed.seen.transforms.static_transform(posed.seen.camera_frame, frame)
-            for frame in {one.frame for one in samples}
-        }
-        forces = np.stack([camera_from_imu[one.frame][:3, :3] @ one.force for one in samples])
-        return [gravity(np.array([one.stamp for one in samples], np.int64), forces, posed.own_poses, scale)]
-    except (NoPathError, GravityError) as error:
-        return [ScaleWarning(str(error))]
+        return [*found, gravity(np.array([one.stamp for one in samples], np.int64), forces, posed.own_poses, scale)]
+    except GravityError as error:
+        return [*found, ScaleWarning(str(error))]
 
 
 def plumb_board(posed: PosedEvidence, scale: float) -> list[Vertical | ScaleWarning]:

@@ -47,7 +47,8 @@ class OverlapTracker:
         digests = model.digests().tolist()
         marks = {stamp: digests[view_of[stamp]] if stamp in view_of else 0 for stamp in stamps}
         changed = []
-        for before, stamp, after in zip([NO_STAMP, *stamps[:-1]], stamps, [*stamps[1:], NO_STAMP], strict=True):
+        padded = [NO_STAMP, *stamps, NO_STAMP]
+        for before, stamp, after in zip(padded[:-2], stamps, padded[2:], strict=True):
             mark = (marks.get(before), marks[stamp], marks.get(after))
             if self._reported.get(stamp) != mark:
                 self._reported[stamp] = mark
