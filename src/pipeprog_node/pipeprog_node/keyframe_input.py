@@ -50,10 +50,6 @@ class KeyframeInput:
             CameraInfo, CALIBRATIONS, received.camera_info, self._on_camera, depth, dropped=self._on_dropped
         )
 
-    def frame_id(self, stamp: int) -> str:
-        """The frame of the camera of a keyframe that was handed on."""
-        return self._keys[stamp][1]
-
     def forget(self, stamps: Iterable[int]) -> None:
         """Keyframes of these stamps may come again."""
         for stamp in stamps:

@@ -315,7 +315,7 @@ class SfmNode(Node):
         if isinstance(event, KeyframeDone):
             self._supervision.answered()
             self._done += 1
-            self._publish_overlap(event.overlaps, messages.header(event.stamp, self._keyframes.frame_id(event.stamp)))
+            self._publish_overlap(event.overlaps, messages.header(event.stamp, event.frame))
             if event.trajectory is not None:
                 self._output.publish_poses(event.trajectory)
         elif isinstance(event, Retired):

@@ -73,6 +73,7 @@ class KeyframeDone:
     """Event: a keyframe was processed; the trajectory is None while there is no scale."""
 
     stamp: int
+    frame: str
     status: Status
     overlaps: list[OverlapReport]
     trajectory: Trajectory | None
@@ -183,7 +184,8 @@ def _add(reconstruction: Reconstruction, keyframe: AddKeyframe) -> KeyframeDone:
     trajectory = None
     with contextlib.suppress(NotMetricError):  # the status says why
         trajectory = reconstruction.trajectory()
-    return KeyframeDone(keyframe.stamp, reconstruction.status(), reconstruction.overlap_reports(), trajectory)
+    overlaps = reconstruction.overlap_reports()
+    return KeyframeDone(keyframe.stamp, keyframe.frame, reconstruction.status(), overlaps, trajectory)
 
 
 def _finish(channel: Channel, reconstruction: Reconstruction, colmap: str) -> Finished:

@@ -89,7 +89,7 @@ def detect_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig
         points, weights = _edge_points(gray, centres, shapes)
         undistorted = lens.undistort_points(points.reshape(-1, 2)).reshape(points.shape)
         # Far outside of a lens's image circle its distortion has no inverse.
-        known = np.isfinite(undistorted).all(-1)
+        known = np.isfinite(undistorted[..., 0]) & np.isfinite(undistorted[..., 1])
         centres, shapes, rms, good = _fit(np.where(known[..., None], undistorted, 0.0), weights * known)
         centres, shapes, rms = centres[good], shapes[good], rms[good]
         good = _plausible(shapes, config)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from targets import CAMERA
 
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_SECONDS
 from pipeprog_sfm.config import OdometryConfig
@@ -138,10 +139,11 @@ def test_the_imu_of_another_robot_does_not_take_the_vertical_away() -> None:
     still = {stamp: np.eye(4) for stamp in KEYFRAMES}
     foreign = [Acceleration(FIRST + SECOND, "foreign", np.array([1.0, 2.0, 3.0]))]
     evidence = ScaleEvidence(transforms=transforms, accelerations=felt("imu") + foreign, camera_frame="camera")
-    found = imu(PosedEvidence(evidence, still, camera=None), 1.0)  # type: ignore[arg-type]
-    assert [type(each) for each in found] == [ScaleWarning, Vertical]
-    assert "'foreign'" in found[0].text
-    assert found[1].up_in_model == pytest.approx([0.0, -1.0, 0.0])
+    warning, vertical = imu(PosedEvidence(evidence, still, CAMERA), 1.0)
+    assert isinstance(warning, ScaleWarning)
+    assert "'foreign'" in warning.text
+    assert isinstance(vertical, Vertical)
+    assert vertical.up_in_model == pytest.approx([0.0, -1.0, 0.0])
 
 
 def test_keyframes_years_apart_give_no_vertical_by_gravity() -> None:
