@@ -17,11 +17,16 @@ from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results.atomic_output import output_file
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.encoded_image import check_size
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_VIDEO_SECONDS
 from pipeprog_camera.outside_text import name_of, shown
 from pipeprog_camera.yaml_file import line_of, read_yaml
 
 FRAME_ID = "camera_optical_frame"
+_ERRORS = 2  # OpenCV's number for messages of errors alone
+# Containers that cameras write; FFmpeg's names.
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg,mxf,mjpeg,h264,hevc"
 # Stamp of the first image [ns]: a video has no clock, and zero means "not set" in ROS.
 START = 1_000_000_000
 
@@ -49,10 +54,15 @@ def ingest(
     capture = _open(video)
     try:
         camera, notes = _fit(capture, calibrated, video, camera_yaml)
-        expected = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        expected = int(_property(capture, cv2.CAP_PROP_FRAME_COUNT))
         stamp, count = START, 0
         with output_file(out, force) as temporary, temporary.open("wb") as stream, BagWriter(stream) as writer:
             for stamp, image in _frames(capture):
+                if (image.shape[1], image.shape[0]) != (camera.width, camera.height):
+                    raise InputError(
+                        f"{video}: frame {count + 1} is {image.shape[1]} x {image.shape[0]}, those before it "
+                        f"{camera.width} x {camera.height}: cut the video there"
+                    )
                 encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
                 info = cdr.write_camera_info(stamp, FRAME_ID, camera)
                 writer.write("/camera/camera_info", cdr.CAMERA_INFO, info, stamp)
@@ -115,11 +125,16 @@ def _number(content: dict[str, Any], key: str, value: Any) -> float:
 
 
 def _open(video: Path) -> Any:
-    if not video.is_file():
+    if not video.exists():
         raise InputError(f"no such video: {video}")
+    if not video.is_file():
+        raise InputError(f"{video} is a folder, a device or a pipe: give a video file")
     # FFmpeg's own messages on stderr are switched off: the errors below say the same, with a remedy.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    capture = cv2.VideoCapture(str(video))
+    cv2.setLogLevel(_ERRORS)
+    # A playlist would open what it names, files and addresses.
+    os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = f"protocol_whitelist;file|format_whitelist;{_CONTAINERS}"
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise InputError(f"{video} is no video that can be read: convert it to H.264 in an .mp4 file")
     return capture
@@ -131,8 +146,12 @@ def _fit(capture: Any, calibrated: Camera, video: Path, camera_yaml: Path) -> tu
     A phone writes the sensor's frames and a rotation. A calibration of upright frames has their size, any other that
     of the sensor.
     """
-    width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-    turned = int(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 != 0
+    width, height = (int(_property(capture, key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    try:
+        check_size(width, height)
+    except InputError as error:
+        raise InputError(f"{video}: {error}: convert it, or film at another size") from None
+    turned = int(_property(capture, cv2.CAP_PROP_ORIENTATION_META)) % 180 != 0
     upright = bool(capture.get(cv2.CAP_PROP_ORIENTATION_AUTO))
     # OpenCV gives the size of the frames that it will return, which are upright if `upright`.
     sensor = (height, width) if turned and upright else (width, height)
@@ -156,15 +175,22 @@ def _fit(capture: Any, calibrated: Camera, video: Path, camera_yaml: Path) -> tu
     )
 
 
+def _property(capture: Any, key: int) -> float:
+    """A number of the container, 0 where it has none."""
+    value = capture.get(key)
+    return value if np.isfinite(value) else 0.0
+
+
 def _frames(capture: Any) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Stamps [ns] and images; where the container has no time for a frame, its rate stands in."""
-    rate = capture.get(cv2.CAP_PROP_FPS)
-    step = round(1e9 / rate) if 0 < rate < 1000 else 33_333_333
+    """Stamps [ns] and images; where the container has no time of a day for a frame, its rate stands in."""
+    rate = _property(capture, cv2.CAP_PROP_FPS)
+    step = round(1e9 / rate) if 0.01 <= rate < 1000 else 33_333_333  # from time lapses to high speed
     last = START - step
     while True:
         ok, image = capture.read()
         if not ok:
             return
-        stamp = START + round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+        seconds = 1e-3 * _property(capture, cv2.CAP_PROP_POS_MSEC)
+        stamp = START + round(seconds * 1e9) if 0 <= seconds < MAX_VIDEO_SECONDS else last
         last = stamp if stamp > last else last + step
         yield last, image

@@ -78,4 +78,5 @@ MAX_DESCRIPTION = 1 << 20  # bytes of a schema or channel record; the largest of
 MAX_CHANNELS = 4096  # topics of one file; a large robot has some hundred
 MAX_BAG_PARTS = 10_000  # files of one folder; a week of files of one minute
 MAX_SMALL_MESSAGE = 1 << 20  # bytes of CameraInfo, Odometry, IMU or TF; a thousand transforms have 100 kB
+MAX_VIDEO_SECONDS = 86_400  # s; a day, more than the battery or the disk of any camera lasts
 MAX_TRIED_IMAGES = 300  # images in which the first usable one is sought: ten seconds of video

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -140,3 +141,66 @@ def test_a_calibration_that_is_no_yaml(tmp_path: Path) -> None:
     for name, expected in (("c.yaml", r"c\.yaml, line 2: is no YAML"), ("absent.yaml", r"absent\.yaml: cannot read")):
         with pytest.raises(InputError, match=expected):
             read_camera(tmp_path / name)
+
+
+def lying_avi(path: Path, size: tuple[int, int] = (160, 96), rate: tuple[int, int] = (1, 25), frames: int = 12) -> Path:
+    """An AVI of twelve JPEG frames of 160 x 96 whose headers say something else (scale and rate, number of frames)."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (160, 96))
+    for number in range(FRAMES):
+        writer.write(np.full((96, 160, 3), 10 * number, np.uint8))
+    writer.release()
+    content = path.read_bytes().replace(struct.pack("<II", 160, 96), struct.pack("<II", *size))
+    content = content.replace(b"\x08" + struct.pack(">HH", 96, 160), b"\x08" + struct.pack(">HH", *size[::-1]))
+    changed = bytearray(content)
+    stream = content.index(b"strh") + 8
+    struct.pack_into("<II", changed, stream + 20, *rate)
+    struct.pack_into("<I", changed, stream + 32, frames)
+    struct.pack_into("<I", changed, content.index(b"avih") + 8 + 16, frames)
+    path.write_bytes(changed)
+    return path
+
+
+NO_VIDEOS = {
+    "cut.mp4": b"\0\0\0\x18ftypisom\0\0\2\0isom\0\0\x40\0moov",
+    "playlist.mp4": b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nv.mp4\n#EXT-X-ENDLIST\n",
+    "list.mp4": b"ffconcat version 1.0\nfile v.mp4\n",
+    "noise.mp4": np.random.default_rng(0).bytes(9000),
+    "empty.mp4": b"",
+}
+
+
+@pytest.mark.parametrize("name", NO_VIDEOS)
+def test_what_is_no_video_is_refused_and_opens_nothing_else(tmp_path: Path, name: str) -> None:
+    video(tmp_path / "v.mp4")
+    (tmp_path / name).write_bytes(NO_VIDEOS[name])
+    with pytest.raises(InputError, match="is no video"):
+        run(tmp_path, tmp_path / name, calibration(tmp_path / "c.yaml"))
+
+
+def test_folders_and_pipes_are_refused_before_they_are_opened(tmp_path: Path) -> None:
+    (tmp_path / "folder.mp4").mkdir()
+    os.mkfifo(tmp_path / "pipe.mp4")
+    for name in ("folder.mp4", "pipe.mp4"):
+        with pytest.raises(InputError, match="a folder, a device or a pipe"):
+            run(tmp_path, tmp_path / name, calibration(tmp_path / "c.yaml"))
+
+
+@pytest.mark.parametrize("size", [(65_500, 65_500), (10_000, 10_000), (16, 16)])
+def test_a_video_that_declares_a_size_it_has_not_is_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+    source = lying_avi(tmp_path / "v.avi", size)
+    with pytest.raises(InputError, match=r"too small|too large"):
+        run(tmp_path, source, calibration(tmp_path / "c.yaml"))
+
+
+@pytest.mark.parametrize("rate", [(0, 0), (0, 25), (1, 0), (1, (1 << 32) - 1), ((1 << 32) - 1, 1)])
+def test_rates_that_are_none_give_stamps_that_rise(tmp_path: Path, rate: tuple[int, int]) -> None:
+    ingested = run(tmp_path, lying_avi(tmp_path / "v.avi", rate=rate), calibration(tmp_path / "c.yaml"))
+    stamps = [frame.stamp for frame in Bag.open(tmp_path / "bag.mcap")]
+    assert stamps == sorted(set(stamps))
+    assert ingested.frames == len(stamps) == FRAMES
+    assert stamps[-1] < START + 86_400 * 10**9
+
+
+def test_frames_that_are_declared_and_not_there_are_told(tmp_path: Path) -> None:
+    ingested = run(tmp_path, lying_avi(tmp_path / "v.avi", frames=10**6), calibration(tmp_path / "c.yaml"))
+    assert "12 of 1000000 frames" in ingested.notes[0]
