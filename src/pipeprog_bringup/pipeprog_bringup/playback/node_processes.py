@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import importlib
 import os
 import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +24,8 @@ import yaml
 from pipeprog_camera.errors import InputError
 
 NODE_MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"}
+SHARED_MEMORY = "/dev/shm"
+_SHARED_BYTES = 65536  # LTTng, which rclpy loads, takes two pages; more for the locks of Python's child processes
 _STOP_SECONDS = 3.0
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None) if os.name == "posix" else None  # no graph runs elsewhere, but the command loads
@@ -33,6 +37,7 @@ class NodeFailure(Exception):
 
 def require_ros() -> None:
     """Raises InputError where this Python cannot import ROS 2 or pipeprog's messages; the text says what is needed."""
+    _require_shared_memory()
     for name in ("rclpy", "pipeprog_msgs.msg"):
         try:
             importlib.import_module(name)
@@ -41,6 +46,19 @@ def require_ros() -> None:
                 f"a replay runs ROS 2 nodes, and this Python cannot import {name} ({error}): run `make setup` in "
                 "pipeprog's repository and use .venv/bin/pipeprog, or source the setup.bash of a workspace in which "
                 "pipeprog is built; the other commands work without ROS"
+            ) from None
+
+
+def _require_shared_memory() -> None:
+    """Raises InputError where /dev/shm is full: on importing rclpy, the kernel would end the process (SIGBUS)."""
+    try:
+        with tempfile.TemporaryFile(dir=SHARED_MEMORY) as file:
+            file.write(bytes(_SHARED_BYTES))
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):  # without the folder, or permission, ROS does without
+            raise InputError(
+                f"{SHARED_MEMORY} is full, and ROS 2 and Python keep a few pages there: remove files of programs that "
+                f"have ended (`ls -l {SHARED_MEMORY}`), or give the container more of it (docker run --shm-size)"
             ) from None
 
 

@@ -24,18 +24,23 @@ _PORTS = 2 * _PARTICIPANTS  # one for discovery and one for data each
 # more port of each process from 400 below the first on (so those of other graphs are 7000 to 7399): blocks of 400 with
 # as many between them keep these apart from the ports of other replays.
 _FIRST_PORTS = [block + offset for block in range(2000, 6800, 800) for offset in range(0, 400 - _PORTS, _PORTS)]
+# Bytes of a socket buffer, as far as the kernel allows (net.core.rmem_max): the usual 208 KiB hold three packets, and
+# a busy reader loses most of a cloud of 60 MB, which are sent again; with 4 MiB it loses few.
+_BUFFER = 4 << 20
 # What is set for live graphs: it would add peers, transports, a discovery server, or keys that the nodes lack.
 _LIVE_SETTINGS = re.compile(
     r"(FASTDDS|FASTRTPS|RMW)_|ROS_(DISCOVERY_SERVER|LOCALHOST_ONLY|SECURITY_|STATIC_PEERS|SUPER_CLIENT)"
 )
 # No multicast: a unicast address without one takes its place, port 0 stands for those of all participants. Shared
-# memory is left out: its files outlive a killed process, and a full /dev/shm would end the nodes.
+# memory is left out: its files outlive a killed process, and containers have 64 MiB of it.
 _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <transport_descriptors>
     <transport_descriptor>
       <transport_id>loopback</transport_id>
       <type>UDPv4</type>
+      <sendBufferSize>{buffer}</sendBufferSize>
+      <receiveBufferSize>{buffer}</receiveBufferSize>
       <interfaceWhiteList><address>{loopback}</address></interfaceWhiteList>
       <maxInitialPeersRange>{participants}</maxInitialPeersRange>
     </transport_descriptor>
@@ -72,7 +77,9 @@ def private_network(folder: Path) -> Iterator[None]:
     _require_loopback()
     first_port, lock = _free_ports()
     profile = folder / "network.xml"
-    profile.write_text(_PROFILE.format(loopback=LOOPBACK, participants=_PARTICIPANTS, first_port=first_port))
+    profile.write_text(
+        _PROFILE.format(loopback=LOOPBACK, buffer=_BUFFER, participants=_PARTICIPANTS, first_port=first_port)
+    )
     chosen = {
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",  # what the profile is for; the default of ROS 2 Jazzy
         "FASTRTPS_DEFAULT_PROFILES_FILE": str(profile),

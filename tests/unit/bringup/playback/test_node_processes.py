@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import errno
+import tempfile
 import time
 from pathlib import Path
 
 import pytest
 
-from pipeprog_bringup.playback.node_processes import Graph, NodeFailure
+from pipeprog_bringup.playback import node_processes
+from pipeprog_bringup.playback.node_processes import Graph, NodeFailure, require_ros
+from pipeprog_camera.errors import InputError
 
 
 def wait_for_failure(graph: Graph) -> None:
@@ -24,3 +28,17 @@ def test_a_node_that_stops_by_itself_is_quoted(tmp_path: Path) -> None:
     assert "stopped with exit code 2" in str(caught.value)
     assert "json.tool: error: " in str(caught.value)
     assert str(tmp_path / "frames.log") in str(caught.value)
+
+
+def test_a_full_shared_memory_is_told_before_rclpy_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(dir: str) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    with pytest.raises(InputError, match="/dev/shm is full"):
+        require_ros()
+
+
+def test_no_shared_memory_is_no_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_processes, "SHARED_MEMORY", str(tmp_path / "missing"))
+    require_ros()
