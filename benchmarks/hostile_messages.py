@@ -44,6 +44,7 @@ from pipeprog_node import messages, qos
 from tests.fuzz.fuzzed_messages import fuzzed_stream, good_messages
 
 PATIENCE = 300.0  # s for what takes seconds on an idle machine
+IN_FLIGHT = 10  # frames of the recording that are sent and not decided on
 FROM_OUTSIDE = ("camera_info", "image/compressed", "image", "odometry", "imu", "/tf", "/tf_static")
 WITH_WORKERS = ("sfm", "detect")
 # Two live runs of one recording differ: the selector hears of overlaps at other moments and chooses other keyframes.
@@ -113,7 +114,8 @@ class Peer:
     def __init__(self, graph: LiveGraph) -> None:
         self.graph = graph
         self.node = Node("peer")
-        self.dropped: dict[str, dict[str, int]] = {}  # by node, "topic: kind"
+        self.values: dict[str, dict[str, str]] = {}  # of the diagnostics, by node
+        self.decided: set[int] = set()
         self.keyframes: set[int] = set()
         self.answered: set[int] = set()
         self.pipes: dict[int, list[msg.Pipe]] = {}  # by revision of the map
@@ -127,6 +129,7 @@ class Peer:
         }
         subscribe = self.node.create_subscription
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        subscribe(msg.FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
         subscribe(CameraInfo, "keyframes/camera_info", self._on_keyframe, qos.reliable(50))
         subscribe(msg.ImageOverlapArray, "image_overlap", self._on_answer, qos.kept(50))
         subscribe(msg.PipeArray, "pipes", self._on_pipes, qos.latched())
@@ -135,7 +138,7 @@ class Peer:
     def connect(self) -> None:
         """Waits until every node hears, and until nothing is subscribed to that is not attacked."""
         self.wait_for(lambda: all(one.get_subscription_count() for one in self._publishers.values()))
-        self.wait_for(lambda: self.dropped.keys() == NODE_MODULES.keys())
+        self.wait_for(lambda: self.values.keys() == NODE_MODULES.keys())
         known = {self.node.resolve_topic_name(topic) for topic in self._publishers}
         for name in NODE_MODULES:
             for topic, _ in self.node.get_subscriber_names_and_types_by_node(name, "/"):
@@ -182,12 +185,11 @@ class Peer:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            counts = {
-                value.key.removeprefix("dropped on "): int(value.value)
-                for value in status.values
-                if value.key.startswith("dropped on ")
-            }
-            self.dropped[status.name.partition(":")[0]] = counts
+            name = status.name.partition(":")[0]
+            self.values[name] = {pair.key: pair.value for pair in status.values}
+
+    def _on_decision(self, message: msg.FrameDecision) -> None:
+        self.decided.add(messages.stamp_ns(message.header.stamp))
 
     def _on_keyframe(self, message: CameraInfo) -> None:
         self.keyframes.add(messages.stamp_ns(message.header.stamp))
@@ -200,7 +202,7 @@ class Peer:
 
 
 def attack(peer: Peer, count: int, seed: int) -> dict[str, Any]:
-    """Sends `count` messages on each topic, absurd requests and absurd parameters; what was sent and dropped."""
+    """Sends `count` messages on each topic; what was sent and, of that, dropped by the nodes."""
     streams = {topic: fuzzed_stream(topic, seed, samples) for topic, samples in _recorded().items()}
     kinds: Counter[str] = Counter()
     for number in range(count):
@@ -212,20 +214,22 @@ def attack(peer: Peer, count: int, seed: int) -> dict[str, Any]:
         if number % 100 == 99:
             print(f"{number + 1} of {count} on each of {len(streams)} topics", flush=True)
             _ = peer.graph.without_worker  # notes the workers that are there
-    accepted = _attack_parameters(peer)
-    answers = {name: _attack_finish(peer, name) for name in NODE_MODULES}
     peer.spin(2.0)  # two diagnostics
     peer.wait_for(lambda: not peer.graph.without_worker)
     return {
         "sent": dict.fromkeys(streams, count),
         "sent of each kind": dict(sorted(kinds.items())),
-        "dropped": peer.dropped,
-        "parameters that took an absurd value": accepted,
-        "answers to an absurd Finish": answers,
+        "dropped": {node: _dropped(values) for node, values in peer.values.items()},
     }
 
 
-def _attack_parameters(peer: Peer) -> list[str]:
+def _dropped(values: dict[str, str]) -> dict[str, int]:
+    """Of a node's diagnostics the messages that were dropped, by "topic: kind"."""
+    prefix = "dropped on "
+    return {key.removeprefix(prefix): int(value) for key, value in values.items() if key.startswith(prefix)}
+
+
+def set_absurd_parameters(peer: Peer) -> list[str]:
     """Sets every parameter of every node to values of other types and ranges; those that were taken."""
     taken = []
     for node in NODE_MODULES:
@@ -236,7 +240,7 @@ def _attack_parameters(peer: Peer) -> list[str]:
     return taken
 
 
-def _attack_finish(peer: Peer, node: str) -> str:
+def absurd_finish(peer: Peer, node: str) -> str:
     """The answer to a request that expects more inputs than can come."""
     answer = peer.call(srv.Finish, f"{node}/finish", srv.Finish.Request(expected_inputs=2**32 - 1))
     return str(answer.message)
@@ -244,18 +248,18 @@ def _attack_finish(peer: Peer, node: str) -> str:
 
 def survey(peer: Peer) -> list[msg.Pipe]:
     """Plays the recording and finishes the survey; its pipes."""
-    bag = Bag.open(DEMO.bag)
-    stamps = set()
-    for frame in bag:
+    peer.wait_for(lambda: peer.values["frames"]["queued"] == peer.values["sfm"]["waiting"] == "0")
+    considered = int(peer.values["frames"]["frames considered"])
+    frames = list(Bag.open(DEMO.bag))
+    stamps = {frame.stamp for frame in frames}
+    for number, frame in enumerate(frames, start=1):
         info = deserialize_message(frame.camera_info, CameraInfo)
         info.header = messages.header(frame.stamp, frame.frame_id)
         peer.publish("camera_info", info)
         peer.publish("image/compressed", frame.data)
-        stamps.add(frame.stamp)
-        peer.spin(0.2)
+        peer.wait_for(lambda: number - len(stamps & peer.decided) < IN_FLIGHT)  # noqa: B023 - called at once
         peer.wait_for(lambda: peer.keyframes & stamps <= peer.answered)
-    _finish(peer, "frames", 0)
-    peer.spin(1.0)
+    _finish(peer, "frames", considered + len(frames))
     peer.wait_for(lambda: peer.keyframes & stamps <= peer.answered)
     revision = _finish(peer, "sfm", 0)
     _finish(peer, "detect", revision)
@@ -325,6 +329,8 @@ def main() -> None:
     out = ROOT / "out" / "hostile"
     with live(out / "attacked") as peer:
         told = attack(peer, arguments.count, arguments.seed)
+        told["parameters that took an absurd value"] = set_absurd_parameters(peer)
+        told["answers to an absurd Finish"] = {name: absurd_finish(peer, name) for name in NODE_MODULES}
         missing, worst_bytes = peer.graph.without_worker, peer.graph.worst_bytes
         restarted = {name: len(seen) - 1 for name, seen in peer.graph.workers.items()}
         worst_seconds, attacked, ended = peer.worst_seconds, survey(peer), peer.graph.ended
