@@ -50,8 +50,8 @@ class _Publisher:
         """All were taken at once."""
 
 
-class _Graph:
-    """Stands for the node that the player publishes with."""
+class Doors:
+    """Stands for the node that the player publishes with: each message must pass the door of the node that takes it."""
 
     def __init__(self, log: FrameLog) -> None:
         self._log = log
@@ -64,7 +64,7 @@ def read(path: Path) -> Reading:
     """Play the recording into doors alone, then pass over it again, as for out.mcap; raises what a replay would."""
     bag = Bag.open(path)
     log = FrameLog()
-    player = Player(_Graph(log), bag, log)
+    player = Player(Doors(log), bag, log)
     sent = player.play(None, lambda seconds: None, lambda due: None)
     assert not log.in_flight, "each frame that was sent has its decision"
     for frame in bag:

@@ -65,15 +65,16 @@ def _one_chunk(records: list[bytes], *others: bytes) -> bytes:
     return mcap.file(mcap.topics(), mcap.chunk(b"".join(records)), *others)
 
 
-def _zstd_of_zeros(size: int, declared: int | None) -> bytes:
-    """A zstd frame of blocks that repeat one byte (RFC 8878, 3.1.1), with or without its size in the header."""
+def zstd_of_zeros(size: int, declared: int | None) -> bytes:
+    """A zstd frame of blocks that repeat a zero (RFC 8878, 3.1.1), with or without a size in its header."""
     block = 1 << 17
     head = b"\x28\xb5\x2f\xfd" + (b"\0\x50" if declared is None else b"\xc0\x50" + struct.pack("<Q", declared))
     repeat = ((1 << 1) | block << 3).to_bytes(3, "little") + b"\0"
     return head + repeat * (size // block - 1) + (1 | 1 << 1 | block << 3).to_bytes(3, "little") + b"\0"
 
 
-def _lz4_of_zeros(size: int) -> bytes:
+def lz4_of_zeros(size: int) -> bytes:
+    """An lz4 frame of blocks of zeros."""
     block = 4 * _MIB
     compressor = lz4.frame.LZ4FrameCompressor(block_size=lz4.frame.BLOCKSIZE_MAX4MB, block_linked=False)
     head = compressor.begin()
@@ -83,13 +84,13 @@ def _lz4_of_zeros(size: int) -> bytes:
 def _bombs() -> Iterator[tuple[str, Case]]:
     for size in (6 << 30, 100 << 30):
         for lie in (0, 1, 1000, 100 * _MIB, 256 * _MIB, size, (1 << 64) - 1):
-            stored = functools.partial(_zstd_of_zeros, size, None)
+            stored = functools.partial(zstd_of_zeros, size, None)
             yield (
                 f"zstd of {size >> 30} GiB that declares {lie}",
                 _bomb(stored, "zstd", lie, quick=lie < 2000 or lie >= size),
             )
     for lie in (0, 1000, 100 * _MIB, 6 << 30):
-        stored = functools.partial(_lz4_of_zeros, 6 << 30)
+        stored = functools.partial(lz4_of_zeros, 6 << 30)
         yield f"lz4 of 6 GiB that declares {lie}", _bomb(stored, "lz4", lie, quick=False)
     for number in (20, 200):
         yield (
@@ -113,17 +114,17 @@ def _bomb(stored: Callable[[], bytes], compression: str, size: int, quick: bool)
 
 
 def _many_bombs(number: int) -> bytes:
-    stored = _zstd_of_zeros(250 * _MIB, None)
+    stored = zstd_of_zeros(250 * _MIB, None)
     return mcap.file(mcap.topics(), mcap.chunk(b"", stored=stored, size=250 * _MIB, crc=0) * number)
 
 
 def _message_bombs(number: int, declared: int | None) -> bytes:
-    bomb = mcap.message(mcap.IMAGE, START, _zstd_of_zeros(6 << 30, declared))
+    bomb = mcap.message(mcap.IMAGE, START, zstd_of_zeros(6 << 30, declared))
     return mcap.file(mcap.topics(), mcap.chunk(mcap.message(mcap.INFO, START, info(0)) + bomb * number))
 
 
 def _beside_a_bomb(before: bool) -> bytes:
-    bomb = mcap.chunk(b"", stored=_zstd_of_zeros(1 << 30, None), size=6 << 30)
+    bomb = mcap.chunk(b"", stored=zstd_of_zeros(1 << 30, None), size=6 << 30)
     frames = mcap.chunk(b"".join(mcap.camera_records()))
     return mcap.file(mcap.topics(), *((frames, bomb) if before else (bomb, frames)))
 
