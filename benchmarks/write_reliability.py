@@ -33,10 +33,13 @@ A message that fails is dropped.
 It is counted by topic and kind in `/diagnostics` (`dropped on TOPIC: KIND`, level WARN), and the first of each kind is said in the node's log, in words.
 Reconstruction and detection run in child processes: one that ends is started again, and what it was working on is not given to it again.
 A latched message that ends a worker is remembered by its digest, so that the middleware's copy of it does no harm either.
+
+A replay talks over the loopback interface alone, at ports that no other graph uses: no foreign message reaches it ([security](security.md)).
 """  # noqa: E501
 
 OPEN = (
-    "A message that is well formed and wrong is believed: who may publish is a matter of SROS2, not of a check.",
+    "A message that is well formed and wrong is believed: who may publish is a matter of SROS2 "
+    "([security](security.md)), not of a check.",
     "rclpy converts a message before the door sees it: a large one of many parts costs the node its time, some 20 "
     "microseconds each.",
     "Damaged CDR bytes are dropped by the middleware (Fast DDS), which writes lines to stderr and counts nothing.",
