@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from pipeprog_camera.errors import InputError
 from pipeprog_frames.overlap_feedback import OverlapReport
 
 MAX_AHEAD = 2  # in lockstep: keyframes that the SfM may still be working on when the next is published
@@ -32,7 +33,9 @@ class Answer:
 class Ledger:
     """Counts of what was published and answered, and the answers that were not used yet."""
 
-    def __init__(self) -> None:
+    def __init__(self, exact: bool = False) -> None:
+        """`exact`: the SfM has begun with this selector and works for it alone, so that it answers to each once."""
+        self._exact = exact
         self.published: list[int] = []  # stamps in the order of publication
         self.lag = 0  # keyframes that the SfM is behind
         self._retirements = self._answered = self._answered_retirements = 0
@@ -47,12 +50,31 @@ class Ledger:
         self._retirements += 1
 
     def receive(self, answer: Answer) -> None:
-        """Notes an answer; its reports wait until they are asked for."""
+        """Notes an answer; its reports wait until they are asked for.
+
+        Raises InputError for an answer that cannot be the SfM's: to more than was published, or a second time.
+        """
+        if self._exact:
+            self._check(answer)
         self._answered = max(self._answered, answer.keyframes)
         self._answered_retirements = max(self._answered_retirements, answer.retirements)
         self._answers.append(answer)
         if answer.stamp in self.published:  # by stamp, since a count would never recover from a lost keyframe
             self.lag = len(self.published) - 1 - self.published.index(answer.stamp)
+
+    def _check(self, answer: Answer) -> None:
+        published, answered = (len(self.published), self._retirements), (self._answered, self._answered_retirements)
+        counts = answer.keyframes, answer.retirements
+        if counts[0] > published[0] or counts[1] > published[1]:
+            raise InputError(
+                f"an answer to {counts[0]} keyframes and {counts[1]} retirements, of which {published[0]} and "
+                f"{published[1]} were published: does another graph run in this ROS domain?"
+            )
+        if sum(counts) <= sum(answered):
+            raise InputError(
+                f"a second answer to {counts[0]} keyframes and {counts[1]} retirements: does another graph run in this "
+                "ROS domain?"
+            )
 
     def reports(self, keyframes: int) -> Iterator[tuple[OverlapReport, ...]]:
         """Takes out the reports of answers to no more than the first `keyframes` keyframes."""

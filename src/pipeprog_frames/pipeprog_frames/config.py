@@ -31,7 +31,7 @@ class FramesConfig:
         0.04, "maximum median parallax between keyframes, as a fraction of the image width", "", (0.005, 0.5)
     )
     window: int = setting(
-        5, "number of frames of which the sharpest is chosen; fewer than replay keeps in flight (8)", "frames", (1, 6)
+        5, "number of frames of which the sharpest is chosen; fewer than replay keeps in flight (10)", "frames", (1, 6)
     )
     buffer_mib: int = setting(
         192,

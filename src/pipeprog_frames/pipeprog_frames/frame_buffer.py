@@ -52,6 +52,11 @@ class FrameStore(ABC):
         self._frames[frame.stamp] = replace(frame, encoded=b"")
         self._places[frame.stamp] = start, len(frame.encoded)
 
+    def forget_from(self, stamp: int) -> None:
+        """Forgets the frames of this stamp and later: the clock was set back, and frames of these stamps may come."""
+        while self._frames and (last := next(reversed(self._frames))) >= stamp:
+            del self._frames[last], self._places[last]
+
     def get(self, stamp: int) -> EncodedFrame | None:
         """The frame, if it is still held."""
         frame = self._frames.get(stamp)
@@ -142,8 +147,8 @@ class FrameFile(FrameStore):
             self._file.flush()
         except OSError as error:
             raise InputError(
-                f"the recording's images do not fit into a file in {tempfile.gettempdir()} ({error.strerror}): "
-                "make room there, or let TMPDIR name a folder that has it"
+                f"the recording's images do not fit into a file in {tempfile.gettempdir()} ({error.strerror} after "
+                f"{start / 1e6:.0f} MB): make room there, or let TMPDIR name a folder that has it"
             ) from None
         self._end += len(encoded)
         return start

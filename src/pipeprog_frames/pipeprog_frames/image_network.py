@@ -6,6 +6,7 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Iterable
 
+from pipeprog_camera.camera import Camera
 from pipeprog_frames.corners import corners
 from pipeprog_frames.frame_decision import DAMAGED, Decision, Load
 from pipeprog_frames.overlap_feedback import MIN_RUN, BestBetween, OverlapReport
@@ -35,6 +36,7 @@ class ImageNetwork:
         self._fixed: set[int] = set()
         self._reports: dict[int, OverlapReport] = {}
         self._last_stamp: int | None = None
+        self._next_start = 0  # stamp before which no further image starts the network
         self.rounds = 0
 
     def consider(self, stamp: int, load: Load | None) -> list[Decision]:
@@ -45,18 +47,26 @@ class ImageNetwork:
         self._last_stamp = stamp
         if load is None:
             return [Decision(stamp, False, DAMAGED)]
-        if self._images and stamp < self._images[-1] + START_PERIOD:
+        if stamp in self._images or stamp in self._removed:  # after the clock was set back
+            return [Decision(stamp, False, "stamp repeats")]
+        if stamp < self._next_start:
             return [Decision(stamp, False, "not in the network")]
         gray = load()
         if gray is None:
             return [Decision(stamp, False, DAMAGED)]
         if len(corners(gray)) < MIN_CORNERS:
             return [Decision(stamp, False, "too few features")]
-        self._images.append(stamp)
+        insort(self._images, stamp)
+        self._next_start = stamp + START_PERIOD
         return [Decision(stamp, True, "start at 0.5 frames a second")]
 
     def flush(self) -> list[Decision]:
         """Nothing: every frame was decided on as it came."""
+        return []
+
+    def begin_anew(self, camera: Camera) -> list[Decision]:
+        """Has the next frame start the network, whatever its stamp is."""
+        self._last_stamp, self._next_start = None, 0
         return []
 
     def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:

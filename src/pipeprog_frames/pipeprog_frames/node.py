@@ -3,36 +3,35 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_NAME
 from pipeprog_frames.acknowledgements import MAX_AHEAD, Answer, Ledger
+from pipeprog_frames.arrival import MAX_QUEUE, Arrival, ArrivalQueue
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import GrayImage, decode_reduced, is_cut_off, reduce_image, reduced_size
-from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
-from pipeprog_frames.frame_decision import DAMAGED, Decision, Load
+from pipeprog_frames.decoding import decode_reduced, reduce_image
+from pipeprog_frames.frame_buffer import EncodedFrame
+from pipeprog_frames.frame_decision import DAMAGED, FAULTS, UNCALIBRATED, Decision
 from pipeprog_frames.overlap_feedback import OverlapReport
-from pipeprog_frames.selection_policy import Policy, make_policy
-from pipeprog_frames.stream import KeyframeStream
-from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
-from pipeprog_msgs.srv import Finish
-from pipeprog_node import messages, qos
+from pipeprog_frames.selection import Selected, Selection
+from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
+from pipeprog_node import messages, qos, received
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.discovery import stages_subscribed
+from pipeprog_node.finish import FinishService
+from pipeprog_node.intake import Intake
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
 
-MAX_QUEUE = 30  # frames that wait, live: one second of a fast camera; older ones would only be late
 STAGES = 2  # nodes of the graph that take keyframes: SfM and detector
 
 
@@ -84,66 +83,95 @@ class KeyframePublisher:
         )
 
 
+class FrameInput:
+    """The topics of the camera and of the SfM's answers.
+
+    Every image is handed on, one that is refused with the reason: each has its decision, which is what a replay counts.
+    A calibration that is refused is handed on as None.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        config: FramesConfig,
+        on_image: Callable[[Arrival], None],
+        on_calibration: Callable[[tuple[int, Camera | None]], None],
+        on_answer: Callable[[Answer], None],
+    ) -> None:
+        self.intake = Intake(node)
+        # Live, a late image is worth less than a fresh one; a recording must lose none.
+        source = qos.reliable(MAX_QUEUE) if config.lockstep else qos.sensor(10)
+        subscribe = partial(self.intake.subscribe, profile=source, overriding=qos.OVERRIDABLE)
+        subscribe(CameraInfo, "camera_info", self._calibration, on_calibration)
+        if config.image_transport != "raw":
+            subscribe(CompressedImage, "image/compressed", partial(self._arrival, "image/compressed"), on_image)
+        if config.image_transport != "compressed":
+            subscribe(Image, "image", partial(self._arrival, "image"), on_image)
+        self._overlaps = self.intake.subscribe(ImageOverlapArray, "image_overlap", _answer, on_answer, qos.reliable(50))
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether an SfM answers."""
+        return self._overlaps.get_publisher_count() > 0
+
+    def _calibration(self, message: CameraInfo) -> tuple[int, Camera | None]:
+        try:
+            info = received.camera_info(message)
+        except InputError as error:
+            self.intake.reject("camera_info", error)
+            return messages.stamp_ns(message.header.stamp), None
+        return info.stamp, info.camera
+
+    def _arrival(self, topic: str, message: Image | CompressedImage) -> Arrival:
+        try:
+            return _compressed(message) if isinstance(message, CompressedImage) else _raw(message)
+        except InputError as error:
+            self.intake.reject(topic, error)
+            header = message.header
+            return Arrival(messages.stamp_ns(header.stamp), header.frame_id[:MAX_NAME], refusal=f"{DAMAGED}: {error}")
+
+
 class FramesNode(Node):
-    """Adapter around a Policy."""
+    """Adapter around a Selection."""
 
     def __init__(self) -> None:
         super().__init__("frames")
         self._config = declare(self, FramesConfig)
         if self._config.policy == "network" and not self._config.lockstep:
             raise InputError("policy = network takes a whole recording: use it with `pipeprog replay`, live use stream")
-        self._camera: Camera | None = None
-        self._policy: Policy | None = None
-        # In a replay the disk that holds the recording can hold its images, too.
-        self._ring: FrameStore = FrameFile() if self._config.lockstep else FrameRing(self._config.buffer_mib << 20)
-        self._queue: deque[Image | CompressedImage] = deque()
+        self._selection = Selection(self._config)
+        self._queue = ArrivalQueue(lossless=self._config.lockstep)
         self._changes: deque[EncodedFrame | list[int]] = deque()  # keyframes to publish; stamps of some to retire
-        self._ledger = Ledger()
-        self._considered = self._damaged = self._dropped = 0
-        self._finish: tuple[int, Future] | None = None
+        self._ledger = Ledger(exact=self._config.lockstep)
+        self._considered = self._dropped = 0
+        self._faults: Counter[str] = Counter()  # images refused, by the beginning of the reason
         self._flushed = False
         self._frame_id = ""  # of the camera, as its last image says
 
         self._publisher = KeyframePublisher(self)
-        # Live, a late image is worth less than a fresh one; a recording must lose none.
-        source = qos.reliable(MAX_QUEUE) if self._config.lockstep else qos.sensor(10)
-        subscribe = partial(self.create_subscription, qos_profile=source, qos_overriding_options=qos.OVERRIDABLE)
-        subscribe(CameraInfo, "camera_info", self._on_camera_info)
-        if self._config.image_transport != "raw":
-            subscribe(CompressedImage, "image/compressed", self._on_image)
-        if self._config.image_transport != "compressed":
-            subscribe(Image, "image", self._on_image)
-        self._overlaps = self.create_subscription(
-            ImageOverlapArray, "image_overlap", self._on_overlap, qos.reliable(50)
-        )
+        self._input = FrameInput(self, self._config, self._on_image, self._on_calibration, self._on_answer)
         if self._config.lockstep:
             self._connecting = self.create_timer(0.1, self._start_when_connected)
-        # In a group of its own: while it waits for the end, the other callbacks must run.
-        self.create_service(Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
+        self._finish = FinishService(self, lambda: self._considered + len(self._queue), self._on_finish)
         self._diagnostics = Diagnostics(self, "keyframes", self._health)
 
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        try:
-            camera = messages.camera_from_info(message)
-        except InputError as error:
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return
-        if camera != self._camera:
-            self._camera = camera
-            self._policy = self._policy or make_policy(self._config, camera, self._ring.sharpest_between)
+    def _on_calibration(self, calibration: tuple[int, Camera | None]) -> None:
+        self._selection.calibrations.add(*calibration)
         self._drain()
 
-    def _on_image(self, message: Image | CompressedImage) -> None:
-        self._queue.append(message)
-        if len(self._queue) > MAX_QUEUE and not self._config.lockstep:
-            self._queue.popleft()
-            self._dropped += 1
-        if self._camera is None:
+    def _on_image(self, arrival: Arrival) -> None:
+        dropped = self._queue.push(arrival)
+        self._dropped += len(dropped)
+        reason = "dropped: newer images had come" if self._selection.calibrations.newest else UNCALIBRATED
+        for each in dropped:
+            self._considered += 1
+            self._decide([(Decision(each.stamp, False, each.refusal or reason), None)])
+        self._drain()
+        if self._selection.calibrations.newest is None:
             self.get_logger().warning(
                 f"images without CameraInfo: publish the calibration on {self.resolve_topic_name('camera_info')}",
                 throttle_duration_sec=10.0,
             )
-        self._drain()
 
     def _start_when_connected(self) -> None:
         if self._is_connected():
@@ -151,106 +179,80 @@ class FramesNode(Node):
             self._drain()
 
     def _is_connected(self) -> bool:
-        return self._publisher.is_connected and self._overlaps.get_publisher_count() > 0
+        return self._publisher.is_connected and self._input.is_connected
 
-    def _on_overlap(self, message: ImageOverlapArray) -> None:
-        self._ledger.receive(_answer(message))
+    def _on_answer(self, answer: Answer) -> None:
+        try:
+            self._ledger.receive(answer)
+        except InputError as error:
+            self._input.intake.reject("image_overlap", error)
+            return
         if not self._config.lockstep:
-            self._apply_reports(message.keyframes_considered)
-            if isinstance(self._policy, KeyframeStream):
-                self._policy.lag(self._ledger.lag)
+            self._apply_reports(answer.keyframes)
+            self._selection.lag(self._ledger.lag)
         self._drain()
 
-    async def _on_finish(self, request: Finish.Request, response: Finish.Response) -> Finish.Response:
-        done: Future = Future()
-        self._finish = (request.expected_inputs, done)
+    def _on_finish(self) -> None:
         self._flushed = False
         self._drain()
-        await done
-        published = len(self._ledger.published)
-        response.success = published > 0
-        response.message = "" if published else "no image could be used as a keyframe: see frame_decisions"
-        response.outputs = published
-        return response
 
     def _drain(self) -> None:
         """Considers, publishes and finishes as far as the SfM's answers allow; called on every arrival."""
-        while self._publish_changes() and self._queue and self._policy is not None:
-            self._consider(self._queue.popleft())
-        if self._finish is None or self._considered < self._finish[0]:
+        while self._publish_changes() and self._queue and self._is_ready(self._queue.head):
+            arrival = self._queue.pop()
+            self._considered += 1
+            self._frame_id = arrival.frame_id
+            self._decide(self._selection.consider(arrival))
+        if self._queue or not self._finish.is_due:
             return
-        if self._policy is not None and not self._flushed:
+        if not self._flushed:
             self._flushed = True
-            self._decide(self._policy.flush())
+            self._decide(self._selection.flush())
         while self._publish_changes() and self._ledger.is_answered:
             self._apply_reports(len(self._ledger.published))
-            if self._policy is not None:
-                self._revise(self._policy.finish_round())
+            self._revise(self._selection.finish_round())
             if not self._changes:
                 self._end()
                 return
 
+    def _is_ready(self, arrival: Arrival) -> bool:
+        """Whether an image can be decided on. Live, one without a calibration of its size waits for the next image."""
+        calibrations = self._selection.calibrations
+        if arrival.refusal or calibrations.is_known(arrival.stamp, arrival.size):
+            return True
+        waited = self._finish.is_due or (len(self._queue) > 1 and calibrations.newest is not None)
+        return waited and not self._config.lockstep
+
     def _end(self) -> None:
-        assert self._finish is not None
-        outside = self._policy.report_outside_band() if self._policy is not None else []
+        outside = self._selection.report_outside_band()
         for decision in outside:
             self._publisher.announce(decision, self._frame_id)
         if outside:
             self.get_logger().info(f"{len(outside)} keyframes are outside the band: frame_decisions has the reasons")
-        done = self._finish[1]
-        self._finish = None
-        done.set_result(None)
+        published = len(self._ledger.published)
+        self._finish.answer(published, "" if published else "no image could be used as a keyframe: see frame_decisions")
 
-    def _consider(self, message: Image | CompressedImage) -> None:
-        assert self._camera is not None
-        assert self._policy is not None
-        self._considered += 1
-        self._frame_id = message.header.frame_id
-        stamp = messages.stamp_ns(message.header.stamp)
-        encoded, load = self._open(message, self._camera)
-        if encoded:
-            self._ring.add(EncodedFrame(stamp, message.header.frame_id, encoded, self._camera))
-        self._decide(self._policy.consider(stamp, load if encoded else None))
-
-    def _open(self, message: Image | CompressedImage, camera: Camera) -> tuple[bytes, Load]:
-        """The image's compressed bytes (none: damaged), and what decodes it reduced and grey."""
-        if isinstance(message, CompressedImage):
-            encoded = bytes(message.data)
-            return b"" if is_cut_off(encoded) else encoded, lambda: self._fitting(
-                decode_reduced(encoded, camera.width), camera
-            )
-        try:
-            image = messages.image_from_msg(message)
-        except InputError as error:
-            self.get_logger().error(str(error), throttle_duration_sec=10.0)
-            return b"", lambda: None
-        gray = self._fitting(reduce_image(image), camera)
-        return messages.encode_jpeg(image), lambda: gray
-
-    def _fitting(self, gray: GrayImage | None, camera: Camera) -> GrayImage | None:
-        """The reduced image, if it has the size that the calibration is for."""
-        if gray is None or (gray.shape[1], gray.shape[0]) == reduced_size(camera.width, camera.height):
-            return gray
-        self.get_logger().error(
-            f"images do not have the size of CameraInfo ({camera.width} x {camera.height}): "
-            "calibrate at the size that the camera sends",
-            throttle_duration_sec=10.0,
-        )
-        return None
-
-    def _decide(self, decisions: list[Decision]) -> None:
+    def _decide(self, selected: Selected) -> None:
         """Announces what became of frames and queues those that were chosen."""
-        for decision in decisions:
-            self._damaged += decision.reason == DAMAGED
+        for decision, frame in selected:
+            if decision.reason.startswith(FAULTS):
+                self._note_fault(decision)
             self._publisher.announce(decision, self._frame_id)
-            frame = self._ring.get(decision.stamp) if decision.chosen else None
             if frame is not None:
                 self._changes.append(frame)
 
-    def _revise(self, decisions: list[Decision]) -> None:
+    def _note_fault(self, decision: Decision) -> None:
+        fault = decision.reason.partition(":")[0]
+        self._faults[fault] += 1
+        if self._faults[fault] == 1:
+            self.get_logger().error(
+                f"image {decision.stamp} is not used: {decision.reason}; more of this kind are counted in /diagnostics"
+            )
+
+    def _revise(self, selected: Selected) -> None:
         """Queues what the overlap reports ask for: frames to add, and keyframes to retire."""
-        self._decide(decisions)
-        retired = [decision.stamp for decision in decisions if not decision.chosen]
+        self._decide(selected)
+        retired = [decision.stamp for decision, _ in selected if not decision.chosen]
         if retired:
             self._changes.append(retired)
 
@@ -274,46 +276,50 @@ class FramesNode(Node):
     def _apply_reports(self, keyframes: int) -> None:
         """Uses the answers to the first `keyframes` keyframes; later ones wait, so that a replay repeats itself."""
         for reports in self._ledger.reports(keyframes):
-            if self._policy is not None:
-                self._revise(self._policy.answer(reports))
+            self._revise(self._selection.answer(reports))
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         values = {
             "frames considered": self._considered,
             "keyframes": len(self._ledger.published),
             "keyframes that the SfM is behind": self._ledger.lag,
-            "damaged": self._damaged,
+            "damaged": self._faults[DAMAGED],
             "dropped": self._dropped,
             "queued": len(self._queue),
+            **{f"frames refused: {fault}": count for fault, count in sorted(self._faults.items())},
+            **self._input.intake.health(),
         }
-        if self._camera is None:
+        if self._selection.calibrations.newest is None:
             return DiagnosticStatus.WARN, "no usable CameraInfo yet", values
-        if isinstance(self._policy, KeyframeStream) and self._policy.overlap_min < self._config.overlap_min:
-            fewer = f"fewer keyframes, at an overlap of {self._policy.overlap_min:.2f}"
+        if self._selection.overlap_min < self._config.overlap_min:
+            fewer = f"fewer keyframes, at an overlap of {self._selection.overlap_min:.2f}"
             return DiagnosticStatus.WARN, f"the SfM cannot keep up: {fewer}", values
         if self._dropped:
             return DiagnosticStatus.WARN, "frames were dropped: the machine cannot keep up", values
+        if self._faults or self._input.intake.rejected:
+            return DiagnosticStatus.WARN, "messages or frames were refused: the counts say which", values
         return DiagnosticStatus.OK, "selecting", values
 
 
+def _compressed(message: CompressedImage) -> Arrival:
+    image = received.compressed_image(message)
+    encoded = image.encoded
+    load = partial(decode_reduced, encoded, image.width)
+    return Arrival(image.stamp, image.frame_id, (image.width, image.height), len(encoded), lambda: encoded, load)
+
+
+def _raw(message: Image) -> Arrival:
+    image = received.raw_image(message)
+    pixels = image.pixels
+    size = pixels.shape[1], pixels.shape[0]
+    encode, load = partial(messages.encode_jpeg, pixels), partial(reduce_image, pixels)
+    return Arrival(image.stamp, image.frame_id, size, pixels.nbytes, encode, load)
+
+
 def _answer(message: ImageOverlapArray) -> Answer:
-    return Answer(
-        messages.stamp_ns(message.header.stamp),
-        message.keyframes_considered,
-        message.retirements_considered,
-        tuple(_report(image) for image in message.images),
-    )
-
-
-def _report(image: ImageOverlap) -> OverlapReport:
-    return OverlapReport(
-        messages.stamp_ns(image.stamp),
-        image.registered,
-        image.overlap,
-        image.cell_overlap,
-        image.matches_previous,
-        image.matches_next,
-    )
+    answer = received.image_overlaps(message)
+    reports = tuple(OverlapReport(**vars(image)) for image in answer.images)
+    return Answer(answer.stamp, answer.keyframes, answer.retirements, reports)
 
 
 def main() -> None:

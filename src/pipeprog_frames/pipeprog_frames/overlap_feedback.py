@@ -43,7 +43,7 @@ class OverlapReport:
 class _Keyframe:
     stamp: int
     overlap: float  # predicted, with the keyframe before it
-    parallax: float
+    parallax: float  # in the unit of parallax_max
     fixed: bool = False  # added by feedback: never retired
     report: OverlapReport | None = None
     bridges: int = 0
@@ -56,7 +56,8 @@ class StreamFeedback:
     A keyframe is judged once the SfM has answered to the next two as well: the first of them matches the other half
     of its image, the second one triangulates it. It gets a frame beside it where the smaller of its two overlaps is
     below `overlap_min`. In groups of more than three above `overlap_max`, every second one is retired where its
-    neighbours still overlap by `overlap_min` with a parallax below `parallax_max` px.
+    neighbours still overlap by `overlap_min` with a parallax below `parallax_max` (in the unit of the
+    decisions that are noted).
 
     This terminates: a frame that was added is never retired, and a retired one is never added again.
     """
@@ -71,6 +72,10 @@ class StreamFeedback:
     def chosen(self, decision: Decision) -> None:
         """Notes a keyframe that the selector has chosen."""
         self._insert(_Keyframe(decision.stamp, decision.overlap, decision.parallax))
+
+    def knows(self, stamp: int) -> bool:
+        """Whether a keyframe had this stamp at any time."""
+        return stamp in self._keyframes or stamp in self._retired
 
     def answer(self, reports: Iterable[OverlapReport], complete: bool = False) -> list[Decision]:
         """Takes overlap reports; returns the frames to add (chosen) and to retire (not chosen).

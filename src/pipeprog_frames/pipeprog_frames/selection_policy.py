@@ -23,6 +23,12 @@ class Policy(Protocol):
     def flush(self) -> list[Decision]:
         """Decides on the frames that are still undecided, after the last one."""
 
+    def begin_anew(self, camera: Camera) -> list[Decision]:
+        """Decides on the frames that are still undecided; the next one has no connection with those before it.
+
+        Its camera may be another, and its stamp earlier.
+        """
+
     def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
         """Takes overlap reports of the SfM; returns keyframes to add (chosen) and to retire (not chosen)."""
 

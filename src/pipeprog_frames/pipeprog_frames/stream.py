@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
@@ -19,10 +20,11 @@ class KeyframeStream:
     """FrameSelector and StreamFeedback together."""
 
     def __init__(self, config: FramesConfig, camera: Camera, best_between: BestBetween) -> None:
+        self._config, self._camera = config, camera
         self._selector = FrameSelector(config, camera)
-        parallax_max = config.parallax_max * camera.width
+        # Parallax as a fraction of the image's width, since keyframes before and after a switch differ in size.
         self._feedback = StreamFeedback(
-            config.overlap_min, config.overlap_min + config.overlap_band, parallax_max, best_between
+            config.overlap_min, config.overlap_min + config.overlap_band, config.parallax_max, best_between
         )
 
     @property
@@ -32,11 +34,19 @@ class KeyframeStream:
 
     def consider(self, stamp: int, load: Load | None) -> list[Decision]:
         """Takes the next frame; see FrameSelector.consider."""
+        if self._feedback.knows(stamp):  # after the clock was set back
+            return [Decision(stamp, False, "stamp repeats")]
         return self._recorded(self._selector.consider(stamp, load))
 
     def flush(self) -> list[Decision]:
         """Decides on the frames that are still undecided."""
         return self._recorded(self._selector.flush())
+
+    def begin_anew(self, camera: Camera) -> list[Decision]:
+        """Decides on the frames that are still undecided; the next one, of whatever camera, starts a new track."""
+        decisions = self.flush()
+        self._camera, self._selector = camera, FrameSelector(self._config, camera)
+        return decisions
 
     def lag(self, keyframes: int) -> None:
         """Notes how many keyframes the SfM is behind: the more, the fewer are chosen."""
@@ -57,5 +67,5 @@ class KeyframeStream:
     def _recorded(self, decisions: list[Decision]) -> list[Decision]:
         for decision in decisions:
             if decision.chosen:
-                self._feedback.chosen(decision)
+                self._feedback.chosen(replace(decision, parallax=decision.parallax / self._camera.width))
         return decisions

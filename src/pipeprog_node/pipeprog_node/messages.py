@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 
 from pipeprog_camera.camera import Camera, check_whole_sensor
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import MAX_CLOUD_FIELDS, MAX_CLOUD_POINTS, MAX_NAME, MAX_QUATERNION_ERROR
+from pipeprog_camera.limits import MAX_CLOUD_FIELDS, MAX_CLOUD_POINTS, MAX_NAME, MAX_QUATERNION_ERROR, MAX_SECONDS
 from pipeprog_camera.raw_image import SAMPLES, check_layout
 
 SECOND = 1_000_000_000  # ns
@@ -49,8 +49,9 @@ def stamp_ns(stamp: Time) -> int:
 
 
 def time_msg(stamp: int) -> Time:
-    """Stamp of nanoseconds."""
-    return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+    """Stamp of nanoseconds; also of those that stamp_ns has made of a stamp whose nanoseconds exceed a second."""
+    sec = min(stamp // SECOND, MAX_SECONDS)
+    return Time(sec=sec, nanosec=stamp - sec * SECOND)
 
 
 def header(stamp: int, frame_id: str) -> Header:

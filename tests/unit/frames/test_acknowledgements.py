@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import pytest
+
+from pipeprog_camera.errors import InputError
 from pipeprog_frames.acknowledgements import MAX_AHEAD, Answer, Ledger
 from pipeprog_frames.overlap_feedback import OverlapReport
 
@@ -49,3 +52,25 @@ def test_a_keyframe_that_was_lost_on_the_way_does_not_count_as_lag_for_ever() ->
         ledger.publish(stamp)
     ledger.receive(answer(9, 9))  # one of ten never arrived
     assert ledger.lag == 0
+
+
+def test_an_answer_that_the_sfm_of_a_replay_cannot_have_given_is_refused() -> None:
+    ledger = Ledger(exact=True)
+    for stamp in range(2):
+        ledger.publish(stamp)
+    with pytest.raises(InputError, match="an answer to 3 keyframes and 0 retirements, of which 2 and 0"):
+        ledger.receive(answer(0, 3))
+    with pytest.raises(InputError, match="does another graph run"):
+        ledger.receive(answer(0, 1, 1))
+    ledger.receive(answer(0, 1))
+    for _ in range(20_000):
+        with pytest.raises(InputError, match="a second answer to 1 keyframes"):
+            ledger.receive(answer(0, 1))
+    assert len(list(ledger.reports(2))) == 1
+
+
+def test_live_the_sfm_may_have_worked_for_others_before() -> None:
+    ledger = Ledger()
+    ledger.publish(0)
+    ledger.receive(answer(7, 500))
+    assert len(list(ledger.reports(500))) == 1

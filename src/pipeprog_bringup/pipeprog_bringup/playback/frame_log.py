@@ -7,9 +7,7 @@ from collections import Counter, defaultdict, deque
 from dataclasses import replace
 
 from pipeprog_bringup.results.result_files import FrameRow
-
-# Beginnings of reasons that are faults of the recording itself.
-FAULTS = ("damaged", "stamp", "size", "calibration")
+from pipeprog_frames.frame_decision import FAULTS
 
 
 class FrameLog:

@@ -19,9 +19,9 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_SMALL_MESSAGE
 from pipeprog_node import messages, qos
 
-IN_FLIGHT = (
-    8  # frames sent and not decided on, at most; more than frames.window (6 at most), or the selector would wait
-)
+# Frames sent and not decided on, at most; more than frames.window (6 at most) and the frames that are held until the
+# next ones confirm their stamps (2) together, or the selector would wait.
+IN_FLIGHT = 10
 KEPT = 1000  # messages of motion, ten times what is ever on its way (MOTION_IN_FLIGHT)
 MAX_GAP = 60.0  # s of the recording between two frames that a rate is held for; a stamp may be years off
 MOTION_IN_FLIGHT = 100  # messages of motion between two waits for the SfM to have them
