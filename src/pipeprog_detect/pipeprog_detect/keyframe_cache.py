@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_detect.types import View
 
 # Decoded images kept [bytes]: 550 of 720p, 60 of 4K.
@@ -34,8 +35,16 @@ class Keyframes:
         self._encoded[stamp] = (encoded, camera)
         self._images.pop(stamp, None)
 
+    def remove(self, stamp: int) -> None:
+        """Forgets a keyframe."""
+        del self._encoded[stamp]
+
+    def is_decoded(self, stamp: int) -> bool:
+        """Whether `view` has the image at hand."""
+        return stamp in self._images
+
     def view(self, stamp: int, map_from_camera: FloatArray) -> View:
-        """The keyframe at its pose (4, 4); raises RuntimeError where it cannot be decoded."""
+        """The keyframe at its pose (4, 4); raises InputError where it cannot be decoded."""
         encoded, camera = self._encoded[stamp]
         image = self._images.pop(stamp, None)
         if image is None:
@@ -48,7 +57,15 @@ class Keyframes:
 
 
 def _decoded(stamp: int, encoded: bytes, camera: Camera) -> NDArray[np.uint8]:
-    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    try:
+        image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # some damaged headers; for other damage it returns None
+        image = None
     if image is None:
-        raise RuntimeError(f"keyframe {stamp} has a pose but cannot be decoded")
+        raise InputError(f"the keyframe at {stamp} ns cannot be decoded")
+    if image.shape != (camera.height, camera.width):
+        raise InputError(
+            f"the keyframe at {stamp} ns has {image.shape[1]} x {image.shape[0]} pixels, its CameraInfo says "
+            f"{camera.width} x {camera.height}: calibrate at the size that the camera sends"
+        )
     return camera.undistort_image(np.asarray(image, np.uint8))

@@ -4,154 +4,131 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.task import Future
-from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_CLOUD_POINTS, MAX_POSES
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
 from pipeprog_detect.product.pipe_runs import PipeRun
-from pipeprog_detect.types import Pipe
-from pipeprog_detect.worker import Keyframe, Map, PipesReady, serve
-from pipeprog_msgs import msg, srv
-from pipeprog_node import messages, qos
+from pipeprog_detect.product.product import Product
+from pipeprog_detect.types import Cylinder, Pipe
+from pipeprog_detect.worker import (
+    Decoding,
+    Event,
+    Keyframe,
+    KeyframeUnusable,
+    Map,
+    NoPipes,
+    PipesReady,
+    Ready,
+    serve,
+)
+from pipeprog_msgs import msg
+from pipeprog_node import messages, qos, received
 from pipeprog_node.diagnostics import Diagnostics
+from pipeprog_node.finish import FinishService
+from pipeprog_node.intake import Intake, InvalidMessageError
+from pipeprog_node.keyframe_input import IMAGES, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare
+from pipeprog_node.received import ReceivedCloud, ReceivedPoses, ReceivedStatus
+from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 
+POINTS, POSES = "map_points", "keyframe_poses"
 MAX_PENDING = 16  # stamps of which one message of three has arrived: poses come after each keyframe, maps rarely
+TICK = 1.0  # s
+# Ticks without a keyframe that a map contains, until the map does without. Both come from this machine or its network
+# within a second; ticks are counted, not seconds, so that a node that stood still first hears what waits for it.
+PATIENCE = 10
 
 
-class DetectNode(Node):
-    """Adapter around the worker process that runs the detector."""
+class CompleteMap(NamedTuple):
+    """The parts of a map."""
 
-    def __init__(self) -> None:
-        super().__init__("detect")
-        config = declare(self, DetectConfig, extra=("boq", "intermediate"))
-        path = str(self.declare_parameter("boq", "").value)
-        if not path:
-            raise InputError("no bill of quantities: set the parameter boq to its file")
-        self._boq: BillOfQuantities = load_boq(path)
-        self._intermediate = bool(self.declare_parameter("intermediate", True).value)
-        self._worker = WorkerProcess(self, serve, (config, self._boq), self._on_event, self._on_death)
-        self._images: dict[int, CompressedImage] = {}
-        self._cameras: dict[int, Camera] = {}
-        self._parts: OrderedDict[int, dict[type, Any]] = OrderedDict()  # of maps, by stamp
-        self._maps: dict[int, msg.SfmStatus] = {}  # handed to the worker, by revision
-        self._received: set[int] = set()  # stamps of keyframes handed to the worker
-        self._uncalibrated: set[int] = set()  # stamps of keyframes whose CameraInfo is no calibration
-        self._revision = self._pipes = 0
-        self._finish: tuple[int, Future] | None = None
+    status: ReceivedStatus
+    poses: ReceivedPoses
+    cloud: ReceivedCloud
 
-        self._array = self.create_publisher(msg.PipeArray, "pipes", qos.latched())
-        self._markers = self.create_publisher(MarkerArray, "pipe_markers", qos.latched())
-        self.create_subscription(CompressedImage, "keyframes/image/compressed", self._on_image, qos.reliable(50))
-        self.create_subscription(CameraInfo, "keyframes/camera_info", self._on_camera_info, qos.reliable(50))
-        self.create_subscription(PointCloud2, "map_points", self._on_map_part, qos.latched())
-        self.create_subscription(Path, "keyframe_poses", self._on_map_part, qos.latched())
-        self.create_subscription(msg.SfmStatus, "sfm_status", self._on_status, qos.latched())
-        # In a group of its own: while it waits for the end, the other callbacks must run.
-        self.create_service(srv.Finish, "~/finish", self._on_finish, callback_group=ReentrantCallbackGroup())
-        self._diagnostics = Diagnostics(self, "pipes", self._health)
 
-    def destroy_node(self) -> None:
-        """Ends the worker with the node."""
-        self._worker.close()
-        super().destroy_node()
+class MapInput:
+    """Subscribes to the parts of maps, which are one map when they have one stamp.
 
-    def _on_image(self, message: CompressedImage) -> None:
-        stamp = messages.stamp_ns(message.header.stamp)
-        self._images[stamp] = message
-        self._pair(stamp)
+    Attributes:
+        revision: the largest of the maps that are complete.
+    """
 
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        stamp = messages.stamp_ns(message.header.stamp)
-        try:
-            self._cameras[stamp] = messages.camera_from_info(message)
-        except InputError as error:
-            self.get_logger().error(f"a keyframe is left out: {error}", once=True)
-            self._uncalibrated.add(stamp)
-        self._pair(stamp)
+    def __init__(self, intake: Intake, use: Callable[[], None]) -> None:
+        """`use` is called when a part has come."""
+        self._use = use
+        self._parts: OrderedDict[int, dict[type, Any]] = OrderedDict()  # by stamp
+        self.revision = 0
+        intake.subscribe(PointCloud2, POINTS, received.map_points, self._keep, qos.latched())
+        intake.subscribe(Path, POSES, received.keyframe_poses, self._keep, qos.latched())
+        intake.subscribe(msg.SfmStatus, "sfm_status", received.sfm_status, self._on_status, qos.latched())
 
-    def _pair(self, stamp: int) -> None:
-        if stamp in self._uncalibrated:
-            self._images.pop(stamp, None)
-            self._hand_over()
-        elif stamp in self._images and stamp in self._cameras:
-            self._worker.send(Keyframe(stamp, bytes(self._images.pop(stamp).data), self._cameras.pop(stamp)))
-            self._received.add(stamp)
-            self._hand_over()
+    @property
+    def newest(self) -> CompleteMap | None:
+        """The complete map whose first part came last."""
+        for parts in reversed(self._parts.values()):
+            if len(parts) == len(CompleteMap._fields):
+                return CompleteMap(parts[ReceivedStatus], parts[ReceivedPoses], parts[ReceivedCloud])
+        return None
 
-    def _on_map_part(self, message: PointCloud2 | Path) -> None:
-        self._keep(messages.stamp_ns(message.header.stamp), message)
+    def discard(self, taken: CompleteMap) -> None:
+        """Forgets a map and those before it."""
+        for stamp in [stamp for stamp in self._parts if stamp <= taken.status.stamp]:
+            del self._parts[stamp]
 
-    def _on_status(self, message: msg.SfmStatus) -> None:
-        if message.map_revision:
-            self._keep(messages.stamp_ns(message.map_stamp), message)
+    def _on_status(self, status: ReceivedStatus) -> None:
+        if status.revision:
+            self._keep(status)
 
-    def _keep(self, stamp: int, part: PointCloud2 | Path | msg.SfmStatus) -> None:
-        self._parts.setdefault(stamp, {})[type(part)] = part
-        while len(self._parts) > MAX_PENDING:
+    def _keep(self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus) -> None:
+        parts = self._parts.setdefault(part.stamp, {})
+        parts[type(part)] = part
+        if len(parts) == len(CompleteMap._fields):
+            self.revision = max(self.revision, parts[ReceivedStatus].revision)
+        while len(self._parts) > MAX_PENDING or (len(self._parts) > 1 and self._points() > MAX_CLOUD_POINTS):
             self._parts.popitem(last=False)
-        self._hand_over()
+        self._use()
 
-    async def _on_finish(self, request: srv.Finish.Request, response: srv.Finish.Response) -> srv.Finish.Response:
-        done: Future = Future()
-        self._finish = (request.expected_inputs, done)
-        self._finish_when_published()
-        self._hand_over()
-        await done
-        response.success = True
-        response.outputs = self._revision
-        return response
+    def _points(self) -> int:
+        clouds = [parts[ReceivedCloud] for parts in self._parts.values() if ReceivedCloud in parts]
+        return sum(len(cloud.points) for cloud in clouds)
 
-    def _finish_when_published(self) -> None:
-        if self._finish is not None and self._revision >= self._finish[0]:
-            self._finish[1].set_result(None)
-            self._finish = None
 
-    def _hand_over(self) -> None:
-        """Sends the newest map to the worker once its cloud, poses, status and keyframes are all there."""
-        for stamp, parts in reversed(self._parts.items()):
-            if len(parts) < 3:
-                continue
-            status = parts[msg.SfmStatus]
-            final = self._finish is not None and status.map_revision >= self._finish[0]
-            stamps, map_from_camera = messages.poses_from_path(parts[Path])
-            if (self._intermediate or final) and self._uncalibrated.union(self._received).issuperset(stamps.tolist()):
-                points, normals = messages.points_from_cloud(parts[PointCloud2])
-                self._maps[status.map_revision] = status
-                self._worker.send(Map(status.map_revision, points, normals, stamps, map_from_camera, final))
-                for earlier in [other for other in self._parts if other <= stamp]:
-                    del self._parts[earlier]
-            return
+class PipeOutput:
+    """Publishes pipes and their markers."""
 
-    def _on_event(self, event: PipesReady) -> None:
-        status = self._maps.pop(event.revision)
-        for earlier in [revision for revision in self._maps if revision < event.revision]:
-            del self._maps[earlier]  # skipped by the worker: a newer map had come
-        header = messages.header(messages.stamp_ns(status.map_stamp), "map")
-        product = event.product
-        self._revision, self._pipes = event.revision, len(product.pipes)
+    def __init__(self, node: Node, boq: BillOfQuantities) -> None:
+        self._boq = boq
+        self._array = node.create_publisher(msg.PipeArray, "pipes", qos.latched())
+        self._markers = node.create_publisher(MarkerArray, "pipe_markers", qos.latched())
+
+    def publish(self, product: Product, status: ReceivedStatus) -> None:
+        """The product of a map."""
+        header = messages.header(status.stamp, "map")
         self._array.publish(
             msg.PipeArray(
                 header=header,
-                map_revision=event.revision,
+                map_revision=status.revision,
                 scale_source=status.scale_source,
                 scale_sigma=status.scale_sigma,
                 pipes=[_pipe_msg(pipe) for pipe in product.pipes],
@@ -163,21 +140,157 @@ class DetectNode(Node):
         for number, marker in enumerate(pipe_markers(product.pipes, self._boq)):
             markers += _marker_msgs(number, marker, header)
         self._markers.publish(MarkerArray(markers=markers))
-        self._finish_when_published()
+
+
+class DetectNode(Node):
+    """Adapter around the worker process that runs the detector."""
+
+    def __init__(self) -> None:
+        super().__init__("detect")
+        config = declare(self, DetectConfig, extra=("boq", "intermediate"))
+        path = str(self.declare_parameter("boq", "").value)
+        if not path:
+            raise InputError("no bill of quantities: set the parameter boq to its file")
+        boq = load_boq(path)
+        self._arguments = config, boq
+        self._intermediate = bool(self.declare_parameter("intermediate", True).value)
+        self._named: dict[str, Cylinder] = {}  # pipes by name, as they were published last
+        self._numbers: dict[int, int] = {}  # of the keyframes handed to the worker, by stamp
+        self._left_out: dict[int, str] = {}  # why no map waits for the keyframe of a stamp
+        self._waited: dict[int, int] = {}  # ticks, by stamp of the keyframes that the newest map waits for
+        self._in_work: ReceivedStatus | None = None  # of the map that the worker has
+        self._revision = self._pipes = 0
+        self._supervision = Supervision(self._start_worker, "the detection process")
+        self._output = PipeOutput(self, boq)
+        self._intake = Intake(self)
+        self._keyframes = KeyframeInput(
+            self._intake, self._on_keyframe, lambda stamp: self._leave_out(stamp, "it was dropped")
+        )
+        self._maps = MapInput(self._intake, self._hand_over)
+        self._finish = FinishService(self, lambda: self._maps.revision, self._on_finish)
+        self._diagnostics = Diagnostics(self, "pipes", self._health)
+        # Steady time: a paused recording stops ROS time.
+        self._timer = self.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def destroy_node(self) -> None:
+        """Ends the worker with the node."""
+        self._supervision.close()
+        super().destroy_node()
+
+    def _on_keyframe(self, stamp: int, encoded: bytes, camera: Camera, frame_id: str) -> None:
+        keyframe = Keyframe(stamp, encoded, camera)
+        if self._supervision.is_poison(keyframe):
+            self._leave_out(stamp, "detection processes died of its image")
+            return
+        self._left_out.pop(stamp, None)
+        self._numbers[stamp] = self._supervision.keep(keyframe)
+        self._hand_over()
+
+    def _leave_out(self, stamp: int, reason: str) -> None:
+        """No map waits for this keyframe any more."""
+        if stamp not in self._numbers:
+            self._left_out[stamp] = reason
+            if len(self._left_out) > MAX_POSES:
+                del self._left_out[next(iter(self._left_out))]
+            self._hand_over()
+
+    def _missing(self, poses: ReceivedPoses) -> set[int]:
+        return set(poses.stamps.tolist()).difference(self._numbers, self._left_out)
+
+    def _hand_over(self) -> None:
+        """Sends the newest map to the worker once its cloud, poses, status and keyframes are all there."""
+        newest = self._maps.newest
+        if newest is None or not self._supervision.takes_requests:
+            return
+        status, poses, cloud = newest
+        final = self._finish.expected is not None and status.revision >= self._finish.expected
+        if not (self._intermediate or final) or self._missing(poses):
+            return
+        self._maps.discard(newest)
+        command = Map(status.revision, cloud.points, cloud.normals, poses.stamps, poses.map_from_camera, final)
+        if self._supervision.is_poison(command):
+            self._refuse(status.revision, "detection processes died of this map before: it is not tried again")
+            return
+        self._in_work = status
+        self._supervision.request(command)
+
+    def _on_finish(self) -> None:
+        self._answer_when_published()
+        self._hand_over()
+
+    def _answer_when_published(self) -> None:
+        if self._finish.expected is not None and self._revision >= self._finish.expected:
+            self._finish.answer(self._revision)
+
+    def _refuse(self, revision: int, problem: str) -> None:
+        """No pipes will come of a map."""
+        self._intake.reject(POINTS, InvalidMessageError("no detection", problem))
+        if self._finish.expected is not None and revision >= self._finish.expected:
+            self._finish.answer(self._revision, problem)
+
+    def _tick(self) -> None:
+        """Gives up keyframes for which the newest map waits in vain."""
+        self._supervision.wake()
+        if self._supervision.problem:
+            self._finish.answer(self._revision, self._supervision.problem)
+        newest = self._maps.newest
+        missing = self._missing(newest.poses) if newest is not None else set()
+        self._waited = {stamp: self._waited.get(stamp, 0) + 1 for stamp in missing}
+        for stamp in [stamp for stamp, ticks in self._waited.items() if ticks >= PATIENCE]:
+            text = f"the pose of a keyframe at {stamp} ns has come, its image has not: it is left out"
+            self._intake.reject(POSES, InvalidMessageError("no image", text))
+            self._left_out[stamp] = text
+        self._hand_over()
+
+    def _start_worker(self, kept: Iterable[Keyframe]) -> WorkerProcess:
+        return WorkerProcess(self, serve, (*self._arguments, kept, self._named), self._on_event, self._on_death)
+
+    def _on_event(self, event: Event) -> None:
+        if isinstance(event, Ready):
+            self._supervision.ready()
+        elif isinstance(event, Decoding):
+            self._supervision.in_work = None if event.stamp is None else self._numbers.get(event.stamp)
+        elif isinstance(event, KeyframeUnusable):
+            self._intake.reject(IMAGES, InvalidMessageError("image", event.problem))
+            self._left_out[event.stamp] = event.problem
+        else:
+            self._supervision.fulfilled()
+            if isinstance(event, NoPipes):
+                self._refuse(event.revision, event.problem)
+            else:
+                self._publish(event)
+            self._hand_over()
+
+    def _publish(self, event: PipesReady) -> None:
+        assert self._in_work is not None
+        product = event.product
+        self._named |= {pipe.id: pipe.cylinder for pipe in product.pipes}
+        self._revision, self._pipes = event.revision, len(product.pipes)
+        self._output.publish(product, self._in_work)
+        self._answer_when_published()
 
     def _on_death(self, exit_code: int) -> None:
-        self.get_logger().fatal(f"the detection process died (exit code {exit_code})")
-        raise SystemExit(1)
+        death = self._supervision.restart(exit_code)
+        self.get_logger().error(death.report)
+        if isinstance(death.dropped, Keyframe):
+            del self._numbers[death.dropped.stamp]
+            self._leave_out(death.dropped.stamp, "detection processes died of its image")
+        if death.failed is not None and self._in_work is not None:
+            self._refuse(self._in_work.revision, death.report)
+        self._hand_over()
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         values = {
-            "keyframes": len(self._received),
-            "keyframes without calibration": len(self._uncalibrated),
+            "keyframes": len(self._numbers),
+            "keyframes left out": len(self._left_out),
             "map revision": self._revision,
             "pipes": self._pipes,
         }
-        if self._uncalibrated:
-            return DiagnosticStatus.WARN, "keyframes without a calibration are left out", values
+        values |= self._intake.health() | self._supervision.health()
+        if self._supervision.problem:
+            return DiagnosticStatus.ERROR, self._supervision.problem, values
+        if self._left_out or self._intake.rejected:
+            return DiagnosticStatus.WARN, "keyframes or messages are left out: the values say of which kind", values
         return DiagnosticStatus.OK, "detecting" if self._revision else "waiting for a map", values
 
 

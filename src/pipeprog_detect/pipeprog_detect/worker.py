@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -17,7 +19,7 @@ from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.pipe_tracker import PipeTracker
 from pipeprog_detect.product.product import Product, product_of
-from pipeprog_detect.types import Cloud
+from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 
 
@@ -28,6 +30,11 @@ class Keyframe:
     stamp: int
     encoded: bytes
     camera: Camera
+
+    @property
+    def content(self) -> tuple[bytes, Camera]:
+        """What is recognised when it comes again, under another stamp, too."""
+        return self.encoded, self.camera
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,31 @@ class Map:
     map_from_camera: NDArray[np.float64]
     final: bool
 
+    @property
+    def content(self) -> tuple[object, ...]:
+        """What is recognised when it comes again, under another revision, too."""
+        return self.points, self.normals, self.stamps, self.map_from_camera
+
+
+@dataclass(frozen=True)
+class Ready:
+    """Event: the keyframes that the predecessor had are taken."""
+
+
+@dataclass(frozen=True)
+class Decoding:
+    """Event: this keyframe is being decoded; None: that is over, and the map is worked on."""
+
+    stamp: int | None
+
+
+@dataclass(frozen=True)
+class KeyframeUnusable:
+    """Event: a keyframe that a map contains is left out, and why."""
+
+    stamp: int
+    problem: str
+
 
 @dataclass(frozen=True)
 class PipesReady:
@@ -53,25 +85,57 @@ class PipesReady:
     product: Product
 
 
-def serve(connection: Connection, config: DetectConfig, boq: BillOfQuantities) -> None:
-    """Works off commands from `connection` until it closes; of the maps that wait, only the newest counts."""
-    keyframes, identities, memory = Keyframes(), PipeTracker(), MeasurementCache()
+@dataclass(frozen=True)
+class NoPipes:
+    """Event: no pipes can be sought in a map, and why."""
+
+    revision: int
+    problem: str
+
+
+Event = Ready | Decoding | KeyframeUnusable | PipesReady | NoPipes
+
+
+def serve(
+    connection: Connection,
+    config: DetectConfig,
+    boq: BillOfQuantities,
+    kept: Iterable[Keyframe],
+    named: Mapping[str, Cylinder],
+) -> None:
+    """Works off commands from `connection` until it closes; a predecessor had these keyframes and gave these names."""
+    keyframes, identities, memory = Keyframes(), PipeTracker(named), MeasurementCache()
+    for keyframe in kept:
+        keyframes.add(keyframe.stamp, keyframe.encoded, keyframe.camera)
+    connection.send(Ready())
     while True:
-        newest: Map | None = None
-        while newest is None or connection.poll():
-            command = connection.recv()
-            if isinstance(command, Keyframe):
-                keyframes.add(command.stamp, command.encoded, command.camera)
-            else:
-                newest = command
-        cloud = Cloud(newest.points.astype(float), None if newest.normals is None else newest.normals.astype(float))
-        views = [
-            keyframes.view(stamp, pose)
-            for stamp, pose in zip(newest.stamps.tolist(), newest.map_from_camera, strict=True)
-            if stamp in keyframes
-        ]
+        command = connection.recv()
+        if isinstance(command, Keyframe):
+            keyframes.add(command.stamp, command.encoded, command.camera)
+            continue
+        views = list(_views(connection, command, keyframes))
         memory.next_map()
-        if newest.final:
+        if command.final:
             memory.novelty = MapChange()
-        pipes = identities.named(detect(cloud, boq, config, views, memory=memory))
-        connection.send(PipesReady(newest.revision, product_of(pipes, boq)))
+        normals = None if command.normals is None else command.normals.astype(float)
+        try:
+            pipes = detect(Cloud(command.points.astype(float), normals), boq, config, views, memory=memory)
+        except InputError as error:
+            connection.send(NoPipes(command.revision, str(error)))
+            continue
+        connection.send(PipesReady(command.revision, product_of(identities.named(pipes), boq)))
+
+
+def _views(connection: Connection, command: Map, keyframes: Keyframes) -> Iterator[View]:
+    """The keyframes of a map that can be decoded; says which one is, so that it is known if this process dies of it."""
+    for stamp, pose in zip(command.stamps.tolist(), command.map_from_camera, strict=True):
+        if stamp not in keyframes:
+            continue
+        if not keyframes.is_decoded(stamp):
+            connection.send(Decoding(stamp))
+        try:
+            yield keyframes.view(stamp, pose)
+        except InputError as error:
+            keyframes.remove(stamp)
+            connection.send(KeyframeUnusable(stamp, str(error)))
+    connection.send(Decoding(None))

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -38,6 +41,7 @@ START = 1_700_000_000_000_000_000
 STEP = 200_000_000
 SETTINGS = ("-p", "contour.enabled:=false")  # the images of these tests show nothing
 JPEG = cv2.imencode(".jpg", np.full((360, 640), 128, np.uint8))[1].tobytes()
+SMALLER = cv2.imencode(".jpg", np.full((180, 320), 128, np.uint8))[1].tobytes()
 BOQ = """classes:
   - {name: DN100, outer_radius_mm: 57.5, planned_length_m: 4.0, color: "#ff0000"}
   - {name: DN50, outer_radius_mm: 30.2, planned_length_m: 2.0}
@@ -204,8 +208,9 @@ def test_a_wrong_calibration_ends_no_node_and_stops_no_map(stage: Callable[..., 
     scene.send_image(stamps[0])
     scene.send_image(stamps[1])
     scene.send_calibration(stamps[1], focal_length=float("nan"))
-    scene.spin_until(lambda: scene.values()["keyframes without calibration"] == "2")
-    assert "without a calibration" in scene.values()[""]
+    scene.spin_until(lambda: scene.values()["keyframes left out"] == "2")
+    assert scene.values()["dropped on keyframes/camera_info: calibration"] == "2"
+    assert "left out" in scene.values()[""]
     scene.send_image(stamps[2])
     scene.send_calibration(stamps[2])
     scene.send_map(START, 1, stamps, corner())
@@ -231,15 +236,74 @@ def test_the_end_of_a_survey_waits_for_the_last_map(stage: Callable[..., Stage])
     assert [message.map_revision for message in scene.pipes] == [2]
 
 
-def test_the_node_ends_with_its_worker(stage: Callable[..., Stage]) -> None:
-    """Whoever launched it starts it again (tests/integration/test_restart.py); one that lives on detects nothing."""
+def test_keyframes_that_are_no_images_are_left_out(stage: Callable[..., Stage]) -> None:
+    scene, broken = stage(), [b"", b"no image", JPEG[:400], SMALLER]
+    stamps = [START + number * STEP for number in range(len(broken))]
+    for stamp, encoded in zip(stamps, broken, strict=True):
+        scene.send_image(stamp, encoded)
+        scene.send_calibration(stamp)
+    scene.send_map(START, 1, stamps, corner())
+    scene.spin_until(lambda: scene.pipes)
+    assert len(scene.pipes[0].pipes) == 3
+    assert scene.values()["keyframes left out"] == str(len(broken))
+
+
+def test_an_image_that_never_comes_is_not_waited_for_for_ever(stage: Callable[..., Stage]) -> None:
     scene = stage()
-    scene.send_image(START, b"no image")
+    scene.send_map(START, 1, [START], corner())
+    scene.spin_until(lambda: scene.pipes)
+    assert scene.values()["dropped on keyframe_poses: no image"] == "1"
+
+
+def test_a_worker_that_is_killed_loses_nothing(stage: Callable[..., Stage]) -> None:
+    """The next one has the keyframes, gives the same names, and makes the map that was in work."""
+    scene = stage()
+    scene.send_image(START)
     scene.send_calibration(START)
     scene.send_map(START, 1, [START], corner())
-    with pytest.raises(SystemExit) as end:
-        scene.spin_until(lambda: scene.pipes)
-    assert end.value.code == 1
+    scene.spin_until(lambda: scene.pipes)
+    kill_worker()
+    scene.send_map(START + STEP, 2, [START], corner()[::-1].copy())
+    scene.spin_until(lambda: len(scene.pipes) > 1)
+    first, second = (
+        {pipe.id: np.round([pipe.start.x, pipe.start.y, pipe.start.z], 2).tolist() for pipe in message.pipes}
+        for message in scene.pipes
+    )
+    assert first == second
+    assert scene.values()["worker restarts"] == "1"
+
+
+def test_a_map_that_kills_is_tried_twice_and_not_when_it_comes_again(stage: Callable[..., Stage]) -> None:
+    scene = stage("-p", "intermediate:=false")
+    finish = scene.others.create_client(Finish, "detect/finish")
+    scene.spin_until(finish.service_is_ready)
+    end = finish.call_async(Finish.Request(expected_inputs=1))
+    points = corner()
+    dense = np.concatenate([points + np.float32(shift) for shift in np.linspace(0.0, 1e-3, 30)])  # to be killed in time
+    scene.send_map(START, 1, [], dense)
+    for _ in range(2):
+        scene.spin_until(lambda: scene.node._in_work is not None and scene.node._supervision.is_ready)
+        deaths = scene.node._supervision.deaths
+        kill_worker()
+        scene.spin_until(lambda: scene.node._supervision.deaths > deaths)  # noqa: B023  # within this turn
+    scene.spin_until(end.done)
+    assert not end.result().success
+    assert "died" in end.result().message
+    end = finish.call_async(Finish.Request(expected_inputs=1))
+    scene.send_map(START, 1, [], dense)  # as a latched topic does
+    scene.spin_until(end.done)
+    assert "not tried again" in end.result().message
+    end = finish.call_async(Finish.Request(expected_inputs=2))
+    scene.send_map(START + STEP, 2, [], points)
+    scene.spin_until(end.done)
+    assert end.result().success
+
+
+def kill_worker() -> None:
+    """Kills the child of this process that detects."""
+    (child,) = [child for child in multiprocessing.active_children() if child.is_alive()]
+    assert child.pid is not None
+    os.kill(child.pid, signal.SIGKILL)
 
 
 def test_without_a_bill_of_quantities_there_is_no_detector() -> None:

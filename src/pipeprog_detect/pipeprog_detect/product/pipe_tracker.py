@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -17,11 +18,14 @@ _LEAST_OFFSET, _ANGLE, _OVERLAP = 0.02, np.radians(5.0), 0.3
 
 
 class PipeTracker:
-    """Names pipes, map after map; a name is never given to another pipe."""
+    """Names pipes, map after map; a name is never given to another pipe.
 
-    def __init__(self) -> None:
-        self._known: dict[str, Cylinder] = {}
-        self._last = 0
+    known: names that are given already, and where each pipe was seen last.
+    """
+
+    def __init__(self, known: Mapping[str, Cylinder] = MappingProxyType({})) -> None:
+        self._known = dict(known)
+        self._last = max((int(name[1:]) for name in known), default=0)
 
     def named(self, pipes: Sequence[Pipe]) -> list[Pipe]:
         """The pipes in their order, each with the id that it had in an earlier map or with the next free one.

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
 from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question
@@ -74,5 +75,5 @@ def test_keyframes_are_decoded_once_within_memory() -> None:
     assert 2 in keyframes
     assert 3 not in keyframes
     keyframes.add(4, b"no image", camera)
-    with pytest.raises(RuntimeError, match="keyframe 4"):
+    with pytest.raises(InputError, match="keyframe at 4 ns"):
         keyframes.view(4, pose)
