@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeprog_bringup.results.scoring import Segment, match, relation
+from pipeprog_bringup.results.scoring import Segment, match, relations
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
@@ -139,9 +139,9 @@ def segment(cylinder: Cylinder, name: str, class_name: str | None = None) -> Seg
 
 def is_decoy(pipe: Segment, decoy: Segment) -> bool:
     """Whether a detection is a round thing that is no pipe, measured as such."""
-    angle, distance, overlap = relation(pipe, decoy)
+    (angle,), (distance,), (overlap,) = relations(pipe, [decoy])
     alike = abs(pipe.radius - decoy.radius) < DECOY_RADIUS_OFF * decoy.radius
-    return alike and angle < 0.2 and distance < decoy.radius and overlap > 0.3 * pipe.length
+    return bool(alike and angle < 0.2 and distance < decoy.radius and overlap > 0.3 * pipe.length)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,8 @@ from typing import Annotated
 import click
 import typer
 
+from pipeprog_camera.outside_text import for_terminal
+
 app = typer.Typer(
     name="pipeprog",
     help="From video of a construction site to the metres of each planned pipe class that are installed.",
@@ -87,7 +89,7 @@ def replay(
     for note in outcome.notes + outcome.losses:
         _note(note)
     print_progress(outcome.product)
-    typer.echo(
+    _say(
         f"{outcome.frames} frames considered, {outcome.registered} of {outcome.keyframes} keyframes registered, "
         f"{len(outcome.product.pipes)} pipes: {out / 'pipes.json'}"
     )
@@ -121,7 +123,7 @@ def detect(
     if detection.dropped:
         _note(f"{detection.dropped} points of {cloud} are not finite or beyond 1e8 m and were left out")
     print_progress(detection.product)
-    typer.echo(f"{len(detection.product.pipes)} pipes in {detection.points} points: {out / 'pipes.json'}")
+    _say(f"{len(detection.product.pipes)} pipes in {detection.points} points: {out / 'pipes.json'}")
 
 
 @app.command(rich_help_panel="To recordings")
@@ -142,7 +144,7 @@ def ingest(
         ingested = run(video, camera, out, quality, force, report)
     for note in ingested.notes:
         _note(note)
-    typer.echo(f"{ingested.frames} frames of {ingested.seconds:.1f} s: {out}")
+    _say(f"{ingested.frames} frames of {ingested.seconds:.1f} s: {out}")
 
 
 @app.command(rich_help_panel="To recordings")
@@ -162,7 +164,7 @@ def board(
     document = board_pdf(pages, paper)
     with output_file(out, force) as file:
         file.write_bytes(document)
-    typer.echo(f"{len(pages)} page{'s' * (len(pages) > 1)}, to be printed at 100 %: {out}")
+    _say(f"{len(pages)} page{'s' * (len(pages) > 1)}, to be printed at 100 %: {out}")
 
 
 @app.command(rich_help_panel="From results")
@@ -200,7 +202,7 @@ def report(
 
     with share_bar("report") as show:
         target = write(folders, out, force, show)
-    typer.echo(f"Report: {target}")
+    _say(f"Report: {target}")
 
 
 @app.command(rich_help_panel="From results")
@@ -221,10 +223,10 @@ def view(
 
     if image is not None:
         display.write_image(folder, image, force)
-        typer.echo(f"Picture: {image}")
+        _say(f"Picture: {image}")
     if mesh is not None:
         display.write_mesh(folder, mesh, force)
-        typer.echo(f"Meshes of the pipes: {mesh}")
+        _say(f"Meshes of the pipes: {mesh}")
     if image is None and mesh is None:
         display.show(folder)
 
@@ -262,13 +264,17 @@ def main() -> None:
     sys.exit(code or 0)
 
 
+def _say(message: str) -> None:
+    typer.echo(for_terminal(message))
+
+
 def _fail(message: str) -> None:
-    typer.secho(f"Error: {message}", fg=typer.colors.RED, err=True)
+    typer.secho(for_terminal(f"Error: {message}"), fg=typer.colors.RED, err=True)
     sys.exit(1)
 
 
 def _note(message: str) -> None:
-    typer.secho(f"Note: {message}", fg=typer.colors.YELLOW, err=True)
+    typer.secho(for_terminal(f"Note: {message}"), fg=typer.colors.YELLOW, err=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 from rich.text import Text
 
+from pipeprog_camera.outside_text import for_terminal
+
 if TYPE_CHECKING:
     from pipeprog_bringup.playback.session import State
     from pipeprog_detect.product.product import Product
@@ -27,9 +29,9 @@ def progress_display() -> Progress:
     """Bars with stage, share and time on stderr; only the last state where stderr is no terminal."""
     return Progress(
         SpinnerColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=30),
-        TextColumn("{task.fields[detail]}"),
+        TextColumn("{task.fields[detail]}", markup=False),
         TimeElapsedColumn(),
         console=Console(stderr=True),
     )
@@ -74,7 +76,7 @@ def print_progress(product: Product) -> None:
     for entry in product.classes:
         count = sum(pipe.class_name == entry.name for pipe in product.pipes)
         lengths = (f"{entry.installed:.2f}", f"{entry.planned:.2f}", f"{entry.percent:.1f}")
-        table.add_row(entry.name, f"{1e3 * entry.outer_radius:.1f}", str(count), *lengths)
+        table.add_row(_name(entry.name), f"{1e3 * entry.outer_radius:.1f}", str(count), *lengths)
     others = [pipe for pipe in product.pipes if pipe.class_name is None]
     if others:
         total = sum(pipe.cylinder.length for pipe in others)
@@ -90,10 +92,11 @@ def print_score(figures: dict[str, Any]) -> None:
     console.print(_errors_table(figures["pipes"]))
     for name, value, form, unit in _single_figures(figures):
         if value is not None:
-            console.print(f"{name:<30} {_number(value, form):>10} {unit}", highlight=False)
+            line = f"{for_terminal(name):<30} {_number(value, form):>10} {unit}"
+            console.print(Text(line))
     for key in ("missed", "false"):
         if figures[key]:
-            console.print(f"{key}: {', '.join(figures[key])}", highlight=False, markup=False)
+            console.print(_name(f"{key}: {', '.join(figures[key])}"))
 
 
 def _rates_table(figures: dict[str, Any]) -> Table:
@@ -113,9 +116,9 @@ def _confusion_table(confusion: dict[str, Any]) -> Table:
     table = Table(title="Pipes of each true class (rows) by the class found (columns)", title_justify="left")
     table.add_column("true \\ found")
     for label in confusion["labels"]:
-        table.add_column(Text(label), justify="right")
+        table.add_column(_name(label), justify="right")
     for label, counts in zip(confusion["labels"], confusion["matrix"], strict=True):
-        table.add_row(Text(label), *map(str, counts))
+        table.add_row(_name(label), *map(str, counts))
     return table
 
 
@@ -134,7 +137,7 @@ def _errors_table(pipes: Sequence[dict[str, Any]]) -> Table:
             (pipe["axis_distance_mm"], ".1f"),
         )
         cells = (_number(value, form) for value, form in measures)
-        table.add_row(Text(pipe["truth"]), Text(pipe["id"]), Text(pipe["class"] or "none"), *cells)
+        table.add_row(_name(pipe["truth"]), _name(pipe["id"]), _name(pipe["class"] or "none"), *cells)
     return table
 
 
@@ -153,6 +156,11 @@ def _single_figures(figures: dict[str, Any]) -> list[tuple[str, float | None, st
             ("worst camera, similarity", figures["trajectory"]["max_similarity_mm"], ".2f", "mm"),
         ]
     return single
+
+
+def _name(name: str) -> Text:
+    """A name from outside: no markup, no control characters."""
+    return Text(for_terminal(name))
 
 
 def _number(value: float | None, form: str) -> str:

@@ -48,7 +48,7 @@ MAX_CAMERAS = 64  # keyframes of one moment: more cameras than any robot has
 MAX_NAME = 256  # characters of a frame or class name; ROS 2 limits topic names to as many
 MAX_SECONDS = 2**31 - 1  # s; builtin_interfaces/Time has 32 bits with a sign
 
-# Bills of quantities and board files.
+# Bills of quantities, board files and results.
 MAX_CLASSES = 1000  # planned classes; all sizes of EN 10220 in all their walls are 600
 MAX_PIPE_RADIUS = 50.0  # m; tunnels have 9
 MIN_PIPE_RADIUS = 1e-4  # m; capillaries have 0.5 mm, and no camera sees them as pipes
@@ -56,12 +56,15 @@ MAX_PIPE_LENGTH = 1e7  # m of one class; the Earth's quarter
 MAX_BOARD_CIRCLES = 256  # of one board; calibration targets have 20 x 14 at most, and symmetries go with the cube
 MAX_CIRCLES = 2000  # of all boards and scale bars of a site, which has ten boards of five
 MAX_KNOWN_DISTANCES = 1000  # between boards; each is measured by hand
+MAX_PIPES = 10_000  # of one survey; a storey of a hospital has some hundreds
+MAX_SCORED = 2000  # pipes of a result or truth that is scored: each is compared with each
 MAX_TARGET_LENGTH = 1e5  # m; a board's circles, and distances between boards on one site
 
 # Files of text.
 MAX_YAML = 1 << 20  # bytes; bills and boards have kilobytes, and libyaml reads a megabyte in under 2 s
 MAX_METADATA = 1 << 22  # bytes of a rosbag2 metadata.yaml; 10 000 files of a split recording take 1.5 MB
 MAX_JSON = 40 << 20  # bytes; MAX_POSES of a truth.json take 32 MB; of empty lists alone, it takes 1 GB in memory
+MAX_TABLE = 64 << 20  # bytes of a trajectory.tum or frames.csv; a frame takes 100: 12 hours at 15 a second
 MAX_DEPTH = 32  # collections within each other; rosbag2 has 8 (QoS of a topic), the other files 5
 MAX_NODES = 1_000_000  # values of a YAML file after its aliases are followed; MAX_METADATA can hold as many, bare
 MAX_TEXT = 1 << 16  # characters of one text in YAML; rosbag2 writes the QoS of 100 publishers as one text of 40 000

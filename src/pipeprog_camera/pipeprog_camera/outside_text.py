@@ -14,6 +14,7 @@ from pipeprog_camera.limits import MAX_NAME
 
 # Line breaks, terminal sequences, what turns the direction of writing, and halves of surrogate pairs.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+_CONTROL_IN_LINES = re.compile(f"(?!\n){_CONTROL.pattern}")
 _SHOWN = 80  # characters of a value in a message; a line of a terminal has as many
 _SHOWN_ITEMS = 4  # of a list or mapping; a row of numbers in a board or bill has two to four
 _SHOWN_DEPTH = 2  # lists within lists that are shown, such as the rows of a board
@@ -23,6 +24,26 @@ def shown(value: Any) -> str:
     """A value as an error message shows it, on one line of at most 80 characters; control characters as escapes."""
     text = _shown(value, _SHOWN_DEPTH)
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+
+
+def for_terminal(text: str) -> str:
+    """A text for a terminal or log: control characters as escapes, so that none moves the cursor or hides a part."""
+    return _CONTROL_IN_LINES.sub(_escape, text)
+
+
+def for_plot(text: str) -> str:
+    """A text for matplotlib, which would read formulas between dollars and leave `_name` out of legends."""
+    plain = _CONTROL.sub(_escape, text).replace("$", r"\$")
+    return f" {plain}" if plain.startswith("_") else plain
+
+
+def for_spreadsheet(text: str) -> str:
+    """A cell of a CSV file; an apostrophe stands before what a spreadsheet would take for a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+
+
+def _escape(found: re.Match[str]) -> str:
+    return repr(found[0])[1:-1]
 
 
 def nearest(value: Any, names: Iterable[str]) -> str:

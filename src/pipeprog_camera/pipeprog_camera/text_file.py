@@ -38,6 +38,8 @@ def require_regular(path: str | Path) -> None:
     """Raises InputError where there is no regular file (or a link to one)."""
     try:
         mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise InputError(f"no such file: {path}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot read the file ({error.strerror}): check the path") from None
     except ValueError:  # NUL, which no path has

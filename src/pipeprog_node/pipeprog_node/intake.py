@@ -13,6 +13,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.outside_text import for_terminal
 
 Message = TypeVar("Message")
 Value = TypeVar("Value")
@@ -66,7 +67,7 @@ class Intake:
         self._rejected[source, kind] += 1
         if self._rejected[source, kind] == 1:
             self._node.get_logger().error(
-                f"dropped a message on {self._node.resolve_topic_name(source)}: {error}; "
+                f"dropped a message on {self._node.resolve_topic_name(source)}: {for_terminal(str(error))}; "
                 "more of this kind are counted in /diagnostics"
             )
 

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.outside_text import for_terminal
 
 STOP_LATENCY = 0.1  # [s] at most from a signal to the end of a node to which no message comes
 
@@ -40,7 +41,7 @@ def run(node_type: Callable[[], Node]) -> None:
         while not stop.is_set():
             executor.spin_once(timeout_sec=STOP_LATENCY)
     except InputError as error:
-        problem = f"error: {error}"
+        problem = for_terminal(f"error: {error}")
     finally:
         if node is not None:
             node.destroy_node()

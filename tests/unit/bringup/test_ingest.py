@@ -138,7 +138,10 @@ def test_bad_calibrations_are_errors(tmp_path: Path, changes: dict[str, Any], ex
 
 def test_a_calibration_that_is_no_yaml(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("{")
-    for name, expected in (("c.yaml", r"c\.yaml, line 2: is no YAML"), ("absent.yaml", r"absent\.yaml: cannot read")):
+    for name, expected in (
+        ("c.yaml", r"c\.yaml, line 2: is no YAML"),
+        ("absent.yaml", r"no such file: .*absent\.yaml"),
+    ):
         with pytest.raises(InputError, match=expected):
             read_camera(tmp_path / name)
 

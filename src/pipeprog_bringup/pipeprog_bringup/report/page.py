@@ -36,7 +36,8 @@ def report(folders: Sequence[Path], out: Path, force: bool, show: Callable[[floa
         raise InputError("a folder is given twice: give each survey once")
     surveys = sorted((read_survey(folder) for folder in folders), key=lambda survey: (survey.time, survey.name))
     with output_file(target, force) as temporary:
-        temporary.write_text(page(surveys, show), encoding="utf-8")
+        # Halves of surrogate pairs, which JSON can hold, are no text in UTF-8.
+        temporary.write_text(page(surveys, show), encoding="utf-8", errors="replace")
     return target
 
 

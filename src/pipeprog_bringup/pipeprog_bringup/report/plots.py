@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeprog_bringup.report.survey_reader import Survey
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.outside_text import for_plot
 
 mpl.use("Agg")
 from matplotlib import dates
@@ -32,7 +33,7 @@ def plan(survey: Survey) -> Figure:
         else:
             axes.plot(x, y, color="#333", lw=4.6, solid_capstyle="butt")
             axes.plot(x, y, color=color, lw=3.4, solid_capstyle="butt")
-        axes.annotate(str(pipe["id"]), (x.mean(), y.mean()), (4, 5), textcoords="offset points", fontsize=8)
+        axes.annotate(for_plot(pipe["id"]), (x.mean(), y.mean()), (4, 5), textcoords="offset points", fontsize=8)
     if survey.positions is not None:
         x, y = survey.positions[:, :2].T
         axes.plot(x, y, "-", color="#d9822b", lw=1.2, marker="o", ms=3, label="camera")
@@ -61,7 +62,7 @@ def _draw_radii(axes: Axes, survey: Survey, radii: FloatArray, nominal: dict[str
         band = max(0.02 * radius, 1.0)
         axes.axvspan(radius - band, radius + band, color=survey.color(name), alpha=0.22, lw=0)
         axes.annotate(
-            name,
+            for_plot(name),
             (radius, 1.0),
             xycoords=("data", "axes fraction"),
             xytext=(0, 3),
@@ -97,7 +98,7 @@ def _draw_deviations(axes: Axes, survey: Survey, radii: FloatArray, nominal: dic
     axes.axhline(0, color="#888", lw=0.8)
     axes.set_xticks(
         range(len(survey.pipes)),
-        [str(pipe["id"]) for pipe in survey.pipes],
+        [for_plot(pipe["id"]) for pipe in survey.pipes],
         fontsize=8,
         rotation=90 if len(survey.pipes) > 20 else 0,
     )
@@ -114,7 +115,7 @@ def series(surveys: Sequence[Survey]) -> Figure:
         installed = [np.nan if entry is None else float(entry["installed_m"]) for entry in own]
         last = next(entry for entry in reversed(own) if entry is not None)
         color = surveys[-1].color(name)
-        axes.plot(times, installed, "-o", color=color, lw=2, ms=6, mec="#333", mew=0.6, label=name)
+        axes.plot(times, installed, "-o", color=color, lw=2, ms=6, mec="#333", mew=0.6, label=for_plot(name))
         axes.axhline(float(last["planned_m"]), color=color, lw=1, ls=":")
     axes.set(ylabel="installed [m] (dotted: planned)")
     axes.set_ylim(bottom=0)

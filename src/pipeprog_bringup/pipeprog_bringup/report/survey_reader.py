@@ -66,5 +66,5 @@ def _time(stamps: NDArray, facts: dict[str, Any], folder: Path) -> datetime:
         return datetime.fromtimestamp(stamps[0] * 1e-9, timezone.utc)
     try:
         return datetime.fromisoformat(str(facts["finished"])).astimezone(timezone.utc)
-    except (KeyError, ValueError):
+    except (KeyError, OverflowError, ValueError):  # none, no date, or one at an end of the calendar
         return datetime.fromtimestamp((folder / "pipes.json").stat().st_mtime, timezone.utc)

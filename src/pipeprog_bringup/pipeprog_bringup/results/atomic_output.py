@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
 import shutil
 import signal
@@ -17,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.json_file import read_json
 
 _STAGE_PREFIX = ".pipeprog-"
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -117,13 +117,18 @@ class OutputFolder:
     def _earlier_files(self) -> list[str]:
         """The files that the run.json in the folder lists as its own."""
         try:
-            names = json.loads((self.path / "run.json").read_text())["files"]
+            names = read_json(self.path / "run.json")["files"]
             return [name for name in names if isinstance(name, str) and self._is_inside(name)]
-        except (OSError, ValueError, KeyError, TypeError):
+        except (InputError, KeyError, TypeError):
             return []
 
     def _is_inside(self, name: str) -> bool:
-        return not Path(name).is_absolute() and ".." not in Path(name).parts
+        """Whether a name is that of a file in this folder: not outside, nor in a folder that a link leads to."""
+        try:
+            path = self.path / name
+            return path.is_file() and path.parent.resolve().is_relative_to(self.path.resolve())
+        except (OSError, ValueError):  # a name that no file system has: NUL, too long
+            return False
 
     def _discard(self, keep_folder: bool = False) -> None:
         if self._stage != self.path:

@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_COORDINATE, MAX_TABLE
+from pipeprog_camera.outside_text import for_spreadsheet, shown
+from pipeprog_camera.text_file import read_text
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.pipe_runs import PipeRun
 from pipeprog_detect.product.product import Product
@@ -87,13 +90,13 @@ def write_pipes(path: Path, product: Product, scale: Scale) -> None:
 
 def write_progress(path: Path, product: Product) -> None:
     """progress.csv: one line a class, for a spreadsheet."""
-    with path.open("w", newline="") as stream:
+    with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes"])
         for entry in product.classes:
             count = sum(pipe.class_name == entry.name for pipe in product.pipes)
             lengths = [f"{entry.planned:.3f}", f"{entry.installed:.3f}", f"{entry.percent:.1f}"]
-            writer.writerow([entry.name, f"{1e3 * entry.outer_radius:.2f}", *lengths, count])
+            writer.writerow([for_spreadsheet(entry.name), f"{1e3 * entry.outer_radius:.2f}", *lengths, count])
 
 
 def write_trajectory(path: Path, stamps: Sequence[int], translations: FloatArray, quaternions: FloatArray) -> None:
@@ -106,7 +109,7 @@ def write_trajectory(path: Path, stamps: Sequence[int], translations: FloatArray
 
 def write_frames(path: Path, rows: Iterable[FrameRow]) -> None:
     """frames.csv: every frame considered, in the order of the recording; the stamp in ns."""
-    with path.open("w", newline="") as stream:
+    with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(FRAME_COLUMNS)
         for row in rows:
@@ -115,12 +118,14 @@ def write_frames(path: Path, rows: Iterable[FrameRow]) -> None:
             registered = "" if row.registered is None else int(row.registered)
             cell_overlap = "" if row.cell_overlap is None else f"{row.cell_overlap:.4f}"
             tie_points = "" if row.tie_points is None else row.tie_points
-            writer.writerow([row.stamp, int(row.chosen), row.reason, *cells, registered, cell_overlap, tie_points])
+            writer.writerow(
+                [row.stamp, int(row.chosen), for_spreadsheet(row.reason), *cells, registered, cell_overlap, tie_points]
+            )
 
 
 def write_config(path: Path, config: dict[str, Any]) -> None:
     """config.yaml: the settings in force."""
-    path.write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True))
+    path.write_text(yaml.safe_dump(config, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def write_run(folder: OutputFolder, facts: dict[str, Any]) -> None:
@@ -160,17 +165,17 @@ def read_trajectory(path: Path) -> tuple[NDArray[np.int64], FloatArray]:
     from scipy.spatial.transform import Rotation
 
     stamps, rows = [], []
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(read_text(path, MAX_TABLE).splitlines(), 1):
         words = line.split("#")[0].split()
         if not words:
             continue
         try:
-            stamps.append(int(Decimal(words[0]) * 10**9))
+            stamps.append(_nanoseconds(words[0]))
             rows.append([float(word) for word in words[1:]])
         except (ValueError, OverflowError, InvalidOperation):
             rows.append([])
-        if len(rows[-1]) != 7 or not np.isfinite(rows[-1]).all() or not any(rows[-1][3:]):
-            raise InputError(f"{path}, line {number}: '{line.strip()}' is not `t tx ty tz qx qy qz qw`")
+        if len(rows[-1]) != 7 or not (np.abs(rows[-1]) <= MAX_COORDINATE).all() or np.linalg.norm(rows[-1][3:]) < 0.5:
+            raise InputError(f"{path}, line {number}: {shown(line.strip())} is not `t tx ty tz qx qy qz qw`")
     values = np.asarray(rows, float).reshape(-1, 7)
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     if len(values):
@@ -179,19 +184,21 @@ def read_trajectory(path: Path) -> tuple[NDArray[np.int64], FloatArray]:
     return np.asarray(stamps, np.int64), poses
 
 
+def _nanoseconds(text: str) -> int:
+    """Seconds, as text, in nanoseconds; ValueError where these have no 64 bits, before 1e999999 is written out."""
+    if not abs(float(text)) < 2**63 / 1e9:
+        raise ValueError(text)
+    return int(Decimal(text) * 10**9)
+
+
 def read_frame_stamps(path: Path) -> NDArray[np.int64]:
     """Stamps (N,) [ns] of the frames in a frames.csv; raises InputError where it is none."""
     try:
-        return np.array([int(row["stamp"]) for row in csv.DictReader(_lines(path))], np.int64)
+        return np.array(
+            [int(row["stamp"]) for row in csv.DictReader(read_text(path, MAX_TABLE).splitlines())], np.int64
+        )
     except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise InputError(f"{path} is no frames.csv ({error}): run `pipeprog replay` again") from None
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
 
 
 def _pipe_entry(pipe: Pipe) -> dict[str, Any]:

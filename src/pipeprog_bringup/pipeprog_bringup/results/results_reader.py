@@ -4,21 +4,25 @@
 from __future__ import annotations
 
 import csv
-import json
+import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from pipeprog_bringup.results.cloud_io import CloudFile, read_cloud
+from pipeprog_bringup.results.pipes_file import read_pipes
 from pipeprog_bringup.results.result_files import read_trajectory
-from pipeprog_bringup.results.scoring import read_json
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.json_file import read_json
+from pipeprog_camera.limits import MAX_TABLE
+from pipeprog_camera.text_file import read_text
+from pipeprog_camera.yaml_file import read_yaml
 from pipeprog_detect.types import Cylinder
 
 Color = tuple[float, float, float]
@@ -27,6 +31,13 @@ UNPLANNED: Color = (0.55, 0.55, 0.58)  # grey: a pipe of no planned class
 _TEXT_COLUMNS = {"reason"}
 _WHOLE_COLUMNS = {"stamp", "tie_points"}
 _YES_NO_COLUMNS = {"chosen", "registered"}
+# Entries of run.json that are shown or followed, and their types.
+_FACT_TYPES: dict[str, type] = {
+    **dict.fromkeys(("command", "bag", "cloud", "finished"), str),
+    **dict.fromkeys(("frames_considered", "frames_in_bag", "keyframes", "registered", "points"), int),
+    **dict.fromkeys(("notes", "losses", "files"), list),
+    **dict.fromkeys(("timings_s", "versions", "seeds"), dict),
+}
 
 
 @dataclass(frozen=True)
@@ -68,8 +79,8 @@ class Results:
         """RGB in 0..1 of each class as config.yaml has it; without that, colours that can be told apart."""
         given = self.config.get("boq", [])
         try:
-            return {str(entry["name"]): _rgb(str(entry["color"])) for entry in given} or _palette(self.classes)
-        except (KeyError, TypeError, ValueError):
+            return {str(entry["name"]): _rgb(entry["color"]) for entry in given} or _palette(self.classes)
+        except (AttributeError, KeyError, TypeError, ValueError):
             return _palette(self.classes)
 
     @cached_property
@@ -79,9 +90,9 @@ class Results:
         if not path.is_file():
             return []
         try:
-            with path.open(newline="") as stream:
-                return [{name: _cell(name, text) for name, text in row.items()} for row in csv.DictReader(stream)]
-        except (AttributeError, TypeError, UnicodeDecodeError, ValueError, csv.Error) as error:
+            rows = csv.DictReader(io.StringIO(read_text(path, MAX_TABLE), newline=""))
+            return [{name: _cell(name, text) for name, text in row.items()} for row in rows]
+        except (AttributeError, TypeError, ValueError, csv.Error) as error:
             raise InputError(f"{path} is no frames.csv ({error}): run `pipeprog replay` again") from None
 
     @property
@@ -112,27 +123,18 @@ def read_results(folder: str | Path) -> Results:
         raise InputError(f"no such folder: {folder}")
     if not (folder / "pipes.json").is_file():
         raise InputError(f"{folder} holds no pipes.json: give the --out of a replay or detect")
-    content = read_json(folder / "pipes.json")
-    try:
-        pipes, classes = list(content["pipes"]), list(content["classes"])
-        for pipe in pipes:
-            values = (*pipe["start"], *pipe["end"], pipe["radius"], pipe["length"], pipe["radius_sigma"], pipe["rmse"])
-            _ = [float(value) for value in values if value is not None], pipe["id"], pipe["class"]
-        for entry in classes:
-            _ = [float(entry[key]) for key in ("outer_radius", "planned_m", "installed_m")], entry["class"]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{folder / 'pipes.json'} is no pipes.json of pipeprog ({error}): run it again") from None
+    file = read_pipes(folder / "pipes.json")
     has_poses = (folder / "trajectory.tum").is_file()
     nothing = np.empty(0, np.int64), np.empty((0, 4, 4))
     stamps, poses = read_trajectory(folder / "trajectory.tum") if has_poses else nothing
     return Results(
         folder=folder,
-        pipes=pipes,
-        classes=classes,
-        runs=list(content.get("runs", [])),
-        scale=content.get("scale", {}),
-        facts=_mapping(folder / "run.json", json.loads),
-        config=_mapping(folder / "config.yaml", yaml.safe_load),
+        pipes=file.pipes,
+        classes=file.classes,
+        runs=file.runs,
+        scale=file.scale,
+        facts=_facts(_mapping(folder / "run.json", read_json)),
+        config=_mapping(folder / "config.yaml", read_yaml),
         stamps=stamps,
         map_from_camera=poses,
     )
@@ -162,10 +164,15 @@ def _cell(name: str, text: str) -> Any:
     return int(text) if name in _WHOLE_COLUMNS else float(text)
 
 
-def _mapping(path: Path, parse: Any) -> dict[str, Any]:
+def _mapping(path: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
     """The mapping in a file that a run may lack, empty where there is none."""
     try:
-        content = parse(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError):
+        content = read(path)
+    except InputError:
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def _facts(content: dict[str, Any]) -> dict[str, Any]:
+    """The entries of run.json without those of another type than pipeprog writes."""
+    return {key: value for key, value in content.items() if isinstance(value, _FACT_TYPES.get(key, object))}

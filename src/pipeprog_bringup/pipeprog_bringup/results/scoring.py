@@ -8,7 +8,6 @@ scored apart.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,13 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from pipeprog_bringup.results.pipes_file import number, rows_of, vector
 from pipeprog_bringup.results.result_files import read_frame_stamps, read_trajectory
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.json_file import read_json
+from pipeprog_camera.limits import MAX_CLASSES, MAX_COORDINATE, MAX_SCORED
+from pipeprog_camera.outside_text import name_of, shown
 from pipeprog_camera.similarity import similarity
 
 # When a detection is a pipe of the truth: axes nearer than the larger of the radius and 20 mm, angle under 3 degrees,
@@ -107,7 +110,7 @@ def score(result: Result, truth: Truth, trajectory: Alignment | None = None) -> 
     found = [_moved(pipe, world_from_map) for pipe in result.pipes]
     matches = match(found, truth.pipes)
     unmatched = [i for i in range(len(found)) if i not in matches]
-    ignored = {i for i in unmatched if any(_is_ignored(found[i], other) for other in truth.ignore)}
+    ignored = {i for i in unmatched if _is_ignored(found[i], truth.ignore)}
     false = [i for i in unmatched if i not in ignored]
     true_classes = [_class_of(pipe.radius, result.class_radii) for pipe in truth.pipes]
     planned = [i for i in matches if found[i].class_name is not None]
@@ -138,27 +141,30 @@ def score(result: Result, truth: Truth, trajectory: Alignment | None = None) -> 
 def match(found: Sequence[Segment], truth: Sequence[Segment]) -> dict[int, int]:
     """The largest one-to-one matching {detection: true pipe}; of several the one that agrees best along the axes."""
     weights = np.zeros((len(found), len(truth)))
+    limits = np.maximum([pipe.radius for pipe in truth], AXIS_DISTANCE_MIN)
+    lengths = np.array([pipe.length for pipe in truth])
     for i, detection in enumerate(found):
-        for j, pipe in enumerate(truth):
-            angle, distance, overlap = relation(detection, pipe)
-            limit = max(pipe.radius, AXIS_DISTANCE_MIN)
-            if angle < ANGLE_MAX and distance < limit and overlap > OVERLAP_MIN * max(pipe.length, detection.length):
-                # Agreement lies in (0, 2): with 4 for each match, two matches always outweigh one that agrees better.
-                weights[i, j] = 4 + overlap / max(pipe.length, detection.length) + 1 - distance / limit
+        angles, distances, overlaps = relations(detection, truth)
+        longer = np.maximum(lengths, detection.length)
+        fits = (angles < ANGLE_MAX) & (distances < limits) & (overlaps > OVERLAP_MIN * longer)
+        # Agreement lies in (0, 2): with 4 for each match, two matches always outweigh one that agrees better.
+        weights[i] = np.where(fits, 4 + overlaps / longer + 1 - distances / limits, 0.0)
     rows, columns = linear_sum_assignment(-weights)
     return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if weights[i, j] > 0}
 
 
-def relation(detection: Segment, pipe: Segment) -> tuple[float, float, float]:
-    """Angle between the axes [rad], their distance in the middle of the common stretch [m], its length [m]."""
-    axis = (pipe.end - pipe.start) / np.linalg.norm(pipe.end - pipe.start)
+def relations(detection: Segment, pipes: Sequence[Segment]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of each pipe (N,): angle between the axes [rad], distance amid the common stretch [m], length of that [m]."""
+    starts, ends = (np.array([getattr(pipe, end) for pipe in pipes]).reshape(-1, 3) for end in ("start", "end"))
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    axes = (ends - starts) / lengths[:, None]
     direction = (detection.end - detection.start) / np.linalg.norm(detection.end - detection.start)
-    angle = float(np.arctan2(np.linalg.norm(np.cross(axis, direction)), abs(axis @ direction)))
-    stretch = sorted(float((end - pipe.start) @ axis) for end in (detection.start, detection.end))
-    low, high = max(stretch[0], 0.0), min(stretch[1], float(np.linalg.norm(pipe.end - pipe.start)))
-    middle = pipe.start + axis * (low + high) / 2
-    distance = float(np.linalg.norm(np.cross(middle - detection.start, direction)))
-    return angle, distance, max(high - low, 0.0)
+    angles = np.arctan2(np.linalg.norm(np.cross(axes, direction), axis=1), np.abs(axes @ direction))
+    stretches = np.stack([((end - starts) * axes).sum(1) for end in (detection.start, detection.end)])
+    low, high = np.maximum(stretches.min(0), 0.0), np.minimum(stretches.max(0), lengths)
+    middles = starts + axes * (low + high)[:, None] / 2
+    distances = np.linalg.norm(np.cross(middles - detection.start, direction), axis=1)
+    return angles, distances, np.maximum(high - low, 0.0)
 
 
 def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Alignment:
@@ -191,15 +197,16 @@ def read_result(path: Path) -> Result:
     """The pipes.json of a run; raises InputError where it is none."""
     content = read_json(path)
     try:
-        pipes = tuple(_segment(path, pipe, str(pipe["id"]), pipe.get("class")) for pipe in content["pipes"])
-        class_radii = {str(entry["class"]): float(entry["outer_radius"]) for entry in content["classes"]}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{path} is no pipes.json of pipeprog ({_named(error)}): run `pipeprog replay` again"
-        ) from None
-    unknown = sorted({pipe.class_name for pipe in pipes if pipe.class_name is not None} - set(class_radii))
-    if unknown:
-        raise InputError(f"{path}: class {unknown[0]} of a pipe is not among its classes: run `pipeprog replay` again")
+        pipes = tuple(_segment(pipe, str(pipe.get("id")), f"pipe {n}") for n, pipe in _numbered(content, "pipes"))
+        rows = rows_of(content, "classes", MAX_CLASSES)
+        class_radii = {
+            str(row.get("class")): number(row, "outer_radius", f"class {n}") for n, row in enumerate(rows, 1)
+        }
+        for pipe in pipes:
+            if pipe.class_name is not None and pipe.class_name not in class_radii:
+                raise InputError(f"class {shown(pipe.class_name)} of a pipe is not among its classes")
+    except InputError as error:
+        raise InputError(f"{path} is no pipes.json of pipeprog ({error}): run `pipeprog replay` again") from None
     return Result(pipes, class_radii)
 
 
@@ -207,12 +214,30 @@ def read_truth(path: Path) -> Truth:
     """A truth file; raises InputError where it is none."""
     content = read_json(path)
     try:
-        pipes = tuple(_segment(path, pipe, str(pipe.get("id", i))) for i, pipe in enumerate(content["pipes"]))
-        ignore = tuple(_segment(path, pipe, "ignore") for pipe in content.get("ignore", []))
-        poses = np.asarray(content.get("camera_to_world", []), float).reshape(-1, 4, 4)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} is no truth file ({_named(error)}): it needs pipes with start, end, radius") from None
+        pipes = tuple(
+            _segment(pipe, str(pipe.get("id", n - 1)), f"pipe {n}") for n, pipe in _numbered(content, "pipes")
+        )
+        ignored = _numbered({"ignore": [], **content}, "ignore")
+        ignore = tuple(_segment(pipe, "ignore", f"cylinder {n} to ignore") for n, pipe in ignored)
+        poses = _poses(content.get("camera_to_world", []))
+    except InputError as error:
+        raise InputError(f"{path} is no truth file ({error}): it needs pipes with start, end, radius") from None
     return Truth(pipes, ignore, poses)
+
+
+def _numbered(content: dict[str, Any], key: str) -> Iterable[tuple[int, dict[str, Any]]]:
+    return enumerate(rows_of(content, key, MAX_SCORED), 1)
+
+
+def _poses(value: Any) -> FloatArray:
+    """(N, 4, 4) of nested lists."""
+    try:
+        poses = np.asarray(value, float).reshape(-1, 4, 4)
+    except (TypeError, ValueError):
+        raise InputError(f"camera_to_world is {shown(value)}, not a list of 4 x 4 matrices") from None
+    if not (np.abs(poses) <= MAX_COORDINATE).all():
+        raise InputError(f"camera_to_world holds more than {MAX_COORDINATE:g} m")
+    return poses
 
 
 def _pairs(trajectory_file: Path, truth_json: Path, truth: Truth) -> tuple[FloatArray, FloatArray]:
@@ -235,29 +260,16 @@ def _pairs(trajectory_file: Path, truth_json: Path, truth: Truth) -> tuple[Float
     return map_from_camera[near], truth.world_from_camera[first[nearest[near]]]
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file; raises InputError where there is none."""
-    try:
-        content = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"no such file: {path}") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} is not JSON that can be read: {error}") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path} holds a {type(content).__name__} where a JSON object belongs")
-    return content
-
-
-def _segment(path: Path, entry: dict[str, Any], name: str, class_name: str | None = None) -> Segment:
-    start, end = (np.asarray(entry[key], float).reshape(3) for key in ("start", "end"))
-    radius, distance = float(entry["radius"]), float(np.linalg.norm(end - start))
-    if not (np.isfinite([*start, *end, radius]).all() and radius > 0 and distance > 0):
-        raise InputError(f"{path}: pipe {name} has no length or radius, or numbers that are not finite")
-    return Segment(start, end, radius, float(entry.get("length", distance)), name, class_name)
-
-
-def _named(error: Exception) -> str:
-    return f"{error} is missing" if isinstance(error, KeyError) else str(error)
+def _segment(entry: dict[str, Any], name: Any, where: str) -> Segment:
+    start, end = (np.array(vector(entry, key, where)) for key in ("start", "end"))
+    radius, distance = number(entry, "radius", where), float(np.linalg.norm(end - start))
+    if radius == 0.0 or distance == 0.0:
+        raise InputError(f"{where} has no length or radius")
+    class_name = entry.get("class")
+    if not isinstance(class_name, str | None):
+        raise InputError(f"class of {where} is {shown(class_name)}, not a name")
+    length = number({"length": distance, **entry}, "length", where)
+    return Segment(start, end, radius, length, name_of(name, f"id of {where}"), class_name)
 
 
 def _moved(pipe: Segment, world_from_map: FloatArray) -> Segment:
@@ -266,10 +278,11 @@ def _moved(pipe: Segment, world_from_map: FloatArray) -> Segment:
     return Segment(*ends, pipe.radius, pipe.length, pipe.id, pipe.class_name)
 
 
-def _is_ignored(detection: Segment, other: Segment) -> bool:
-    angle, distance, overlap = relation(detection, other)
-    near = distance < max(other.radius, AXIS_DISTANCE_MIN)
-    return angle < IGNORE_ANGLE_MAX and near and overlap > OVERLAP_MIN * min(other.length, detection.length)
+def _is_ignored(detection: Segment, ignore: Sequence[Segment]) -> bool:
+    angles, distances, overlaps = relations(detection, ignore)
+    near = distances < np.maximum([other.radius for other in ignore], AXIS_DISTANCE_MIN)
+    common = overlaps > OVERLAP_MIN * np.minimum([other.length for other in ignore], detection.length)
+    return bool(((angles < IGNORE_ANGLE_MAX) & near & common).any())
 
 
 def _class_of(radius: float, class_radii: dict[str, float]) -> list[str]:
@@ -283,7 +296,7 @@ def _class_of(radius: float, class_radii: dict[str, float]) -> list[str]:
 
 
 def _errors(detection: Segment, pipe: Segment) -> dict[str, Any]:
-    angle, distance, _ = relation(detection, pipe)
+    (angle,), (distance,), _ = relations(detection, [pipe])
     return {
         "id": detection.id,
         "truth": pipe.id,
@@ -292,7 +305,7 @@ def _errors(detection: Segment, pipe: Segment) -> dict[str, Any]:
         "true_length": pipe.length,
         "radius_error_mm": 1e3 * (detection.radius - pipe.radius),
         "length_error_percent": 100 * (detection.length - pipe.length) / pipe.length,
-        "axis_distance_mm": 1e3 * distance,
+        "axis_distance_mm": 1e3 * float(distance),
         "angle_deg": float(np.degrees(angle)),
     }
 

@@ -111,6 +111,16 @@ def test_several_surveys_become_a_series_in_the_order_of_their_dates(tmp_path: P
     assert page.count("<svg") == 3
 
 
+@pytest.mark.parametrize(
+    "name", [r"$\frac{1}{$", "[/red]x", "=cmd|' /C calc'!A0", "_hidden", "<script>alert(1)</script>", "{{ 7 * 7 }}"]
+)
+def test_names_are_shown_as_they_are(tmp_path: Path, name: str) -> None:
+    folders = [survey(tmp_path / "a", 0, name=name), survey(tmp_path / "b", 7, name=name)]
+    page, text = read(report(folders, tmp_path / "report.html", False, silent))
+    assert name in text
+    assert "<script" not in page
+
+
 def test_classes_by_posterior_are_set_against_those_by_kmeans(tmp_path: Path) -> None:
     folder = survey(tmp_path / "run", name="<b>")
     content = json.loads((folder / "pipes.json").read_text())

@@ -69,6 +69,39 @@ def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
     }
 
 
+def test_a_class_name_is_no_formula_of_a_spreadsheet(tmp_path: Path) -> None:
+    name = "=cmd|' /C calc'!A0"
+    product = Product([replace(PIPE, class_name=name)], [replace(CLASSES[0], name=name)], [])
+    result_files.write_progress(tmp_path / "progress.csv", product)
+    with (tmp_path / "progress.csv").open(newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    assert (row["class"], row["pipes"]) == (f"'{name}", "1")
+    result_files.write_pipes(tmp_path / "pipes.json", product, SCALE)
+    assert json.loads((tmp_path / "pipes.json").read_text())["pipes"][0]["class"] == name
+
+
+def test_only_files_of_the_folder_are_removed_with_an_earlier_run(tmp_path: Path) -> None:
+    out, mine = tmp_path / "out", tmp_path / "mine"
+    out.mkdir()
+    mine.mkdir()
+    (mine / "a.txt").write_text("keep")
+    (out / "link").symlink_to(mine)
+    (out / "old.csv").write_text("old")
+    names = ["old.csv", "link/a.txt", "../mine/a.txt", str(mine / "a.txt"), "a\0b", "x" * 5000, "", ".", 3]
+    (out / "run.json").write_text(json.dumps({"files": names}))
+    with OutputFolder(out, True) as folder:
+        folder.file("new.csv").write_text("new")
+    assert (mine / "a.txt").read_text() == "keep"
+    assert not (out / "old.csv").exists()
+
+
+@pytest.mark.parametrize("stamp", ["1e999999999", "inf", "nan", "-1e30", "1" * 5000])
+def test_a_stamp_beyond_all_times_is_refused_at_once(tmp_path: Path, stamp: str) -> None:
+    (tmp_path / "trajectory.tum").write_text(f"{stamp} 0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match="line 1"):
+        result_files.read_trajectory(tmp_path / "trajectory.tum")
+
+
 def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     pipe = Pipe("p01", PIPE.cylinder, float("nan"), None, 0.0, 2.6, 0.001, 3)
     result_files.write_pipes(tmp_path / "pipes.json", Product([pipe], CLASSES, []), Scale("board", None))

@@ -160,5 +160,5 @@ def test_a_wall_is_for_cameras_inside(tmp_path: Path) -> None:
 
 
 def test_a_missing_boq_is_reported_with_its_path(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.yaml: cannot read"):
+    with pytest.raises(InputError, match=r"no such file: .*none\.yaml"):
         load_boq(tmp_path / "none.yaml")
