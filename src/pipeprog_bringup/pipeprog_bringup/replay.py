@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -15,8 +13,9 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph, NodeFailure
+from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph
 from pipeprog_bringup.playback.private_network import private_network
+from pipeprog_bringup.playback.scratch import check_room, scratch_folder
 from pipeprog_bringup.playback.session import Session, State
 from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, write_survey
 from pipeprog_bringup.recording.bag import Bag
@@ -75,8 +74,9 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     Raises InputError for what the user can mend and NodeFailure when a node dies, hangs or fails; either leaves no
     process and no file behind.
     """
+    check_room(request.bag)
     inputs = _read(request)
-    with OutputFolder(request.out, request.force) as folder, _scratch() as scratch:
+    with OutputFolder(request.out, request.force) as folder, scratch_folder() as scratch:
         parameters = _parameters(request, inputs.configs, folder.file("colmap"))
         session = Session(inputs.bag, request.rate, report)
         with private_network(scratch), Graph(parameters, scratch, modules) as graph, _ros():
@@ -154,20 +154,6 @@ def _facts(request: Request, inputs: _Inputs, outcome: Outcome, timings: dict[st
         "seeds": {node: config.seed for node, config in inputs.configs.items() if hasattr(config, "seed")},
         "timings_s": timings,
     }
-
-
-@contextlib.contextmanager
-def _scratch() -> Iterator[Path]:
-    """A folder for parameter files and logs, removed at the end; kept where a node failed, for its log."""
-    path = Path(tempfile.mkdtemp(prefix="pipeprog-"))
-    try:
-        yield path
-    except NodeFailure:
-        raise
-    except BaseException:
-        shutil.rmtree(path, ignore_errors=True)
-        raise
-    shutil.rmtree(path, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import warnings
 from collections.abc import Mapping, Sequence
@@ -108,6 +109,7 @@ def read_rows(
     Lines without numbers are passed over.
     """
     _check_lines(path, stream)
+    lines = io.TextIOWrapper(stream, encoding="utf-8")
     kind = np.dtype([(name, field.kind) for name, field in fields.items()])
     chunks: list[NDArray] = [np.empty(0, kind)]
     rows = 0
@@ -117,13 +119,12 @@ def read_rows(
         while fields and rows < count:
             try:
                 chunk = np.loadtxt(
-                    stream,
+                    lines,
                     kind,
                     delimiter=delimiter,
                     comments=comments,
                     usecols=[field.position for field in fields.values()],
                     ndmin=1,
-                    encoding="utf-8",
                     max_rows=min(_ROWS, count - rows),
                 )
             except DeprecationWarning:
