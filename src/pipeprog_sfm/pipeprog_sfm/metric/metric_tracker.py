@@ -44,8 +44,8 @@ class MetricTracker:
         self._config = config
         self._odometry = odometry
         self._sources = sources
-        self._cameras: dict[int, Camera] = {}  # of the keyframes of `_frame`
-        self._frame: str | None = None
+        self._cameras: dict[int, Camera] = {}
+        self._first_frame: str | None = None
         self._frames: dict[int, str] = {}
         self._ellipses: dict[int, ImageEllipses] = {}
         self._observations: dict[int, list[BoardObservation]] = {}
@@ -59,13 +59,11 @@ class MetricTracker:
             stamp: time of the keyframe [ns].
             gray: (H, W) uint8 image as the camera saw it: edges are measured before the lens distortion is removed.
             camera: calibration.
-            frame: name of the camera's optical frame; boards are measured with the first camera alone.
+            frame: name of the camera's optical frame.
         """
         self._frames[stamp] = frame
-        if self._frame is None:
-            self._frame = frame
-        if frame != self._frame:
-            return []
+        if self._first_frame is None:
+            self._first_frame = frame
         self._cameras[stamp] = camera
         ellipses = detect_ellipses(gray, camera, self._config)
         found = detect_boards(ellipses, self._board_file.boards, camera)
@@ -104,9 +102,12 @@ class MetricTracker:
         Raises:
             NoScaleError: as `estimate_scale`.
         """
-        if not self._cameras or self._frame is None:
+        cameras = Counter(self._cameras[stamp] for stamp in poses if stamp in self._cameras)
+        if not cameras:
             raise NoScaleError("no_board", "no keyframe has been seen yet")
-        camera = self._usual_camera()
+        # A camera may switch its resolution, and a robot has several: all is measured in pixels of the usual one. Noise
+        # is taken to be the same number of these in every image, which is right for most of them.
+        camera = cameras.most_common(1)[0][0]
         other = {stamp: own for stamp, own in self._cameras.items() if own != camera}
         seen = ScaleEvidence(
             self._board_file,
@@ -120,16 +121,18 @@ class MetricTracker:
             },
             self._transforms,
             self._accelerations,
-            self._frame,
+            self._usual_frame(poses),
             self._frames,
         )
         posed = PosedEvidence(seen, poses, camera, self._config, self._odometry, points)
         return estimate_scale(posed, covariance, self._sources)
 
-    def _usual_camera(self) -> Camera:
-        """The calibration of most keyframes: a camera may switch its resolution, and all is measured in pixels of one.
+    def _usual_frame(self, poses: Mapping[int, FloatArray]) -> str:
+        """The frame that is followed by odometry and IMU: the first one, unless another has twice as many keyframes.
 
-        Noise is taken to be the same number of these pixels in every image: right for most of them, and a single
-        keyframe of another resolution does not change the unit.
+        Cameras of a rig have as many each; a few keyframes that somebody else published before do not count.
         """
-        return Counter(self._cameras.values()).most_common(1)[0][0]
+        counts = Counter(self._frames[stamp] for stamp in poses if stamp in self._frames)
+        assert self._first_frame is not None
+        usual, most = max(counts.items(), key=lambda item: item[1], default=(self._first_frame, 0))
+        return usual if most > 2 * counts[self._first_frame] else self._first_frame

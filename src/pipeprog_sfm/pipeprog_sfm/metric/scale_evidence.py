@@ -30,7 +30,7 @@ class ScaleEvidence:
         ellipses: all ellipses of the images, by stamp: an image counts even where it shows a single circle of a board.
         transforms: odometry and TF.
         accelerations: of an IMU.
-        camera_frame: optical frame of the camera that measures boards.
+        camera_frame: optical frame of the camera whose way odometry and IMU tell.
         frames: optical frame of each image, by stamp; missing for images of `camera_frame`. Images of another camera
             of the rig tell the scale by where it is mounted.
     """
@@ -68,7 +68,7 @@ class PosedEvidence:
     Attributes:
         seen: the evidence.
         poses: (4, 4) camera_from_model by stamp [ns] in order of time, model units; other images are left out.
-        camera: calibration of `seen.camera_frame`.
+        camera: in whose pixels boards and ellipses are given.
         board_config: eccentricity, tolerance, upright.
         odometry_config: standard deviations of odometry and rig.
         points: gives (N, 3) points of the model, should nothing else tell the vertical.

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from targets import BOARD, CAMERA, LOPSIDED, Walk, camera_from_board, exact_ellipses, render
 
+from pipeprog_camera.camera import Camera
 from pipeprog_camera.similarity import similarity
 from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_check import circle_residuals
@@ -275,6 +276,21 @@ def test_tracker_measures_rendered_images():
         assert len(tracker.add(stamp, render(BOARD, pose, seed=stamp), CAMERA)) == 1
         poses[stamp] = walk.in_model(pose)
     assert tracker.estimate(poses).scale * walk.factor == pytest.approx(1.0, abs=5e-4)
+
+
+def test_tracker_measures_images_of_every_size_and_camera():
+    tracker, walk = MetricTracker(BoardFile([BOARD]), CONFIG), Walk(9)
+    small = Camera(480, 320, 371.0, 373.0, 241.0, 158.0)
+    poses = {}
+    tracker.add(100, np.zeros((48, 64), np.uint8), Camera(64, 48, 50.0, 50.0, 31.5, 23.5), "somebody else's")
+    for stamp, x in enumerate((-0.6, -0.3, 0.0, 0.3, 0.6)):
+        camera = small if stamp % 2 else CAMERA
+        pose = camera_from_board((x, 0.05, 1.3), (0.3 * x, 0, 0))
+        assert len(tracker.add(stamp, render(BOARD, pose, camera, seed=stamp), camera, "camera")) == 1
+        poses[stamp] = walk.in_model(pose)
+    estimate = tracker.estimate(poses)
+    assert estimate.scale * walk.factor == pytest.approx(1.0, abs=5e-4)
+    assert estimate.views == (0, 1, 2, 3, 4)
 
 
 class DriftingWalk:
