@@ -54,6 +54,7 @@ class Case:
         return path
 
 
+@functools.cache
 def cases() -> dict[str, Case]:
     """All of them by name."""
     files = (_bombs, _chunks, _records, _floods, _channels, _ends, _times, _folders)
@@ -208,20 +209,21 @@ def _floods() -> Iterator[tuple[str, Case]]:
         "70000 channels",
         Case(lambda: mcap.good(mcap.chunk(b"".join(_channel(n) for n in range(10, 65_536)) * 2)), quick=False),
     )
-    schemas = b"".join(mcap.schema(number, "a/msg/B", bytes(900)) for number in range(3, 65_536))
-    yield "65000 schemas", Case(lambda: mcap.good(mcap.chunk(schemas)), quick=False)
+    yield "65000 schemas", Case(lambda: mcap.good(mcap.chunk(_schemas())), quick=False)
     indexes = mcap.index(7, [(0, 0)] * 100_000)
     yield "ten million entries of an index", Case(lambda: mcap.good(indexes * 100), quick=False)
     empties = mcap.chunk(b"")
     yield "100000 empty chunks", Case(lambda: mcap.good(empties * 100_000), quick=False)
-    frames = b"".join(mcap.message(mcap.INFO, START + n, info(0, frame_id=f"camera{n}")) for n in range(20_000))
-    yield (
-        "20000 cameras in one topic",
-        Case(
-            lambda: mcap.file(mcap.topics(), mcap.chunk(frames), mcap.chunk(b"".join(mcap.camera_records()))),
-            quick=False,
-        ),
-    )
+    yield "20000 cameras in one topic", Case(_many_frames, usable=_FRAMES, quick=False)
+
+
+def _schemas() -> bytes:
+    return b"".join(mcap.schema(number, "a/msg/B", bytes(900)) for number in range(3, 65_536))
+
+
+def _many_frames() -> bytes:
+    infos = (mcap.message(mcap.INFO, START + n, info(0, frame_id=f"camera{n}")) for n in range(20_000))
+    return mcap.file(mcap.topics(), mcap.chunk(b"".join(infos)), mcap.chunk(b"".join(mcap.camera_records())))
 
 
 def _channel(number: int) -> bytes:
@@ -540,12 +542,8 @@ def _folders() -> Iterator[tuple[str, Case]]:
         "nothing": (None, "no rosbag2 metadata"),
     }
     for what, (names, refused) in metadata.items():
-        text = yaml.safe_dump({"rosbag2_bagfile_information": {"relative_file_paths": names}}).encode()
-        usable = None if refused else _FRAMES
-        yield (
-            f"names {what}",
-            Case(_constant({**part, "metadata.yaml": text}), refused, usable, quick="0 of" not in what),
-        )
+        make = functools.partial(_folder, names, part)
+        yield f"names {what}", Case(make, refused, None if refused else _FRAMES, quick="0 of" not in what)
     texts = {
         "a million names": b"rosbag2_bagfile_information: {relative_file_paths: [" + b"part.mcap," * 1_000_000 + b"]}",
         "nested 100000 deep": b"rosbag2_bagfile_information: " + b"[" * 100_000,
@@ -578,6 +576,12 @@ def _folders() -> Iterator[tuple[str, Case]]:
     ]
     compressed[5] = mcap.message(mcap.IMAGE, START + 2 * STEP, zstandard.compress(image(2))[:-9])
     yield "compressed messages, one cut", Case(_constant(_one_chunk(compressed)), usable=_FRAMES - 1)
+
+
+def _folder(names: Any, parts: Mapping[str, bytes]) -> Mapping[str, bytes]:
+    """The parts with a metadata.yaml of these names."""
+    content = {"rosbag2_bagfile_information": {"relative_file_paths": names}}
+    return {**parts, "metadata.yaml": yaml.safe_dump(content).encode()}
 
 
 def _constant(content: Any) -> Callable[[], Any]:
