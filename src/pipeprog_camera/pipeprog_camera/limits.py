@@ -23,6 +23,7 @@ MAX_DISTORTION_COEFFICIENTS = 14  # of rational_polynomial, the longest model
 # Clouds and trajectories.
 MAX_CLOUD_POINTS = 1 << 26  # points; 67 million: a building at 5 mm; 1.6 GB as coordinates in double precision
 MAX_CLOUD_FIELDS = 256  # of a point; LAS has at most 40, descriptors of PCL are one field of several values
+MAX_POINT_STEP = 1 << 16  # bytes of a point; the longest descriptors of PCL have 8 kB, NumPy ends at 2^31
 MAX_NORMAL_ERROR = 0.01  # of a normal's length from 1; halves of single precision, as some writers store, keep 0.001
 MAX_POSES = 100_000  # keyframes; 14 hours at two a second
 MAX_OVERLAP = 1.001  # share of an image; areas of nearly equal hulls round to more than 1 in 32 bits

@@ -17,7 +17,14 @@ from std_msgs.msg import Header
 
 from pipeprog_camera.camera import Camera, check_whole_sensor
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import MAX_CLOUD_FIELDS, MAX_CLOUD_POINTS, MAX_NAME, MAX_QUATERNION_ERROR, MAX_SECONDS
+from pipeprog_camera.limits import (
+    MAX_CLOUD_FIELDS,
+    MAX_CLOUD_POINTS,
+    MAX_NAME,
+    MAX_POINT_STEP,
+    MAX_QUATERNION_ERROR,
+    MAX_SECONDS,
+)
 from pipeprog_camera.raw_image import SAMPLES, check_layout
 
 SECOND = 1_000_000_000  # ns
@@ -199,6 +206,8 @@ def table_from_cloud(message: PointCloud2) -> NDArray[np.void]:
         raise InputError(f"a point cloud of {width} x {height} points is too large: {MAX_CLOUD_POINTS} at most")
     if len(message.fields) > MAX_CLOUD_FIELDS:
         raise InputError(f"a point cloud of {len(message.fields)} fields is none: {MAX_CLOUD_FIELDS} at most")
+    if step > MAX_POINT_STEP:
+        raise InputError(f"damaged point cloud: points of {step} bytes: {MAX_POINT_STEP} at most")
     layout = _layout(message)
     row_step = message.row_step if height > 1 else width * step
     if row_step < width * step or len(message.data) < row_step * height:

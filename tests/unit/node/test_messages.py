@@ -196,3 +196,12 @@ def test_cloud_that_cannot_be_used_is_reported() -> None:
     message.data = message.data[:-1]
     with pytest.raises(InputError, match="damaged point cloud"):
         messages.points_from_cloud(message)
+
+
+@pytest.mark.parametrize("count", [1, 2**31 - 1, 2**28])
+def test_a_point_of_gigabytes_is_refused(count: int) -> None:
+    """NumPy raises ValueError where the size of an element does not fit into 32 bits with a sign."""
+    message = messages.point_cloud(messages.header(0, "map"), np.zeros((0, 3)))
+    message.point_step, message.fields[0].count = 2**32 - 1, count
+    with pytest.raises(InputError, match="points of 4294967295 bytes"):
+        messages.points_from_cloud(message)
