@@ -37,6 +37,25 @@ A latched message that ends a worker is remembered by its digest, so that the mi
 A replay talks over the loopback interface alone, at ports that no other graph uses: no foreign message reaches it ([security](security.md)).
 """  # noqa: E501
 
+PLACES = """## Where it runs
+
+Neither a home folder nor an installation that can be written is needed, nor the rights of root.
+
+Libraries keep files between runs: Numba compiled functions (beside the sources where these can be written, else in `XDG_CACHE_HOME`), Matplotlib a list of fonts (`XDG_CONFIG_HOME`, `XDG_CACHE_HOME`), ROS logs (`ROS_HOME`).
+A variable whose folder cannot be written, or has less than 32 MB left, is set to a private folder `pipeprog-home-*` among the temporary files, by `pipeprog_camera.user_folders`; the next run uses the same one.
+Compiled functions are programs: a folder there is used only where it belongs to the user and nobody else may write it.
+The first run in it compiles for some minutes.
+
+| lacking | what happens |
+|---|---|
+| home folder, or `HOME` not set | as above; the results have the same bytes |
+| a folder for temporary files | a command that needs one says so before it reads anything: let `TMPDIR` name one |
+| room there | a replay holds its recording's images there, and says before it begins where they do not fit |
+| room for the results | said before the work begins; what the folder held stays |
+
+Nodes on a robot keep the journal of their keyframes among the temporary files, and their logs in `ROS_LOG_DIR` or `ROS_HOME`.
+"""  # noqa: E501
+
 OPEN = (
     "A message that is well formed and wrong is believed: who may publish is a matter of SROS2 "
     "([security](security.md)), not of a check.",
@@ -75,6 +94,7 @@ def reliability(results: Mapping[str, Mapping[str, Any]]) -> str:
         + ".\nMemory is that of the largest process, with Python and its libraries.\n",
         *_failures(results),
         DOOR,
+        PLACES,
         "## Limits\n",
         "From `pipeprog_camera/limits.py`.\n",
         table(("limit", "value", "unit and reason"), _limits(Path(limits.__file__).read_text())),
