@@ -39,7 +39,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_detect.cloud import axis_voting, local_shape, octree, plane_segmentation
 from pipeprog_detect.cloud.cylinder_fit import basis, fit_cylinder
 from pipeprog_detect.cloud.ellipse_search import find_ellipses
-from pipeprog_detect.silhouette.apparent_contour import project, tangent_normals
+from pipeprog_detect.silhouette.apparent_contour import contour_samples, project
 from pipeprog_detect.silhouette.limb_edges import LINEAR_LIGHT, limb_basis
 from pipeprog_detect.thin.line_segments import segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
@@ -434,10 +434,8 @@ def runs(survey: Survey, figure: Figure) -> None:
 
 def _contour_lines(pipe: Cylinder, view: View) -> tuple[FloatArray, float]:
     """The apparent contour's lines (2 sides, 2 ends, 2) [px] over the barrel, and their distance in the middle [px]."""
-    normals = tangent_normals(pipe, view.centre)
-    assert normals is not None
-    touching = [np.stack([pipe.start, pipe.end]) - pipe.radius * normal for normal in normals]
-    lines = np.stack([project(view, points)[0] for points in touching])
+    at = contour_samples(pipe, [view], np.eye(3)[:2], 1.0, margin=-np.inf)
+    lines = np.stack([at.pixel[at.side == side][[0, -1]] for side in (0, 1)])
     return lines, float(np.linalg.norm(lines[0].mean(axis=0) - lines[1].mean(axis=0)))
 
 

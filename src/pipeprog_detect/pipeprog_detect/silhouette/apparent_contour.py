@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
@@ -71,25 +72,6 @@ class ContourSamples:
         return along, index.astype(np.int64)
 
 
-def tangent_normals(cylinder: Cylinder, centre: FloatArray) -> FloatArray | None:
-    """Unit normals (2, 3) of the planes through `centre` that touch the cylinder; None where it lies inside.
-
-    Both point inwards: the axis lies at distance `radius` on their positive side. The tangent-plane form of the
-    apparent contour of a straight homogeneous generalised cylinder.
-    """
-    axis, radius = cylinder.axis, cylinder.radius
-    offset = cylinder.start - centre
-    offset = offset - axis * (axis @ offset)
-    distance = float(np.linalg.norm(offset))
-    if distance <= radius * (1.0 + 1e-9):
-        return None
-    towards = offset / distance
-    across = np.cross(axis, towards)
-    sine = radius / distance
-    cosine = np.sqrt(1.0 - sine * sine)
-    return np.stack([sine * towards + cosine * across, sine * towards - cosine * across])
-
-
 def project(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pixels (N, 2) and depths (N,) [m] of points (N, 3) of the map."""
     in_camera = points @ view.camera_from_map[:3, :3].T + view.camera_from_map[:3, 3]
@@ -127,45 +109,92 @@ def contour_samples(
     step = spacing / float(np.median(gains))
     count = max(int(cylinder.length / step), 4)
     fractions = (np.arange(count) + 0.5) / count
-    parts: list[tuple[NDArray[np.generic], ...]] = []
-    for index, view in enumerate(views):
-        for side, columns in _sides(cylinder, view, basis, fractions, margin):
-            total = len(columns[0])
-            parts.append((np.full(total, index), np.full(total, side), *columns))
-    if not parts:
-        empty = np.zeros(0)
-        none = np.zeros(0, int)
-        return ContourSamples(none, none, np.zeros((0, 2)), np.zeros((0, 2)), empty, empty, empty, np.zeros((0, 5)))
-    return ContourSamples(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    poses = np.stack([view.camera_from_map[:3] for view in views])
+    lenses = np.array([[view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy] for view in views])
+    sizes = np.array([[view.camera.width, view.camera.height] for view in views], float)
+    centres = np.stack([view.centre for view in views])
+    line = np.stack([cylinder.start, cylinder.axis])
+    view, side, position, columns = _contour_lines(
+        line, cylinder.length, cylinder.radius, poses, lenses, sizes, centres, basis, fractions, margin
+    )
+    share, gain = fractions[position], columns[:, 4]
+    jacobian = np.empty((len(view), 5))
+    jacobian[:, 0:2] = (gain * (1.0 - share))[:, None] * columns[:, 5:7]
+    jacobian[:, 2:4] = (gain * share)[:, None] * columns[:, 5:7]
+    jacobian[:, 4] = gain
+    along = (share - 0.5) * cylinder.length
+    return ContourSamples(view, side, columns[:, 0:2], columns[:, 2:4], along, gain, gain * cylinder.radius, jacobian)
 
 
-def _sides(
-    cylinder: Cylinder, view: View, basis: FloatArray, fractions: FloatArray, margin: float
-) -> Iterator[tuple[int, tuple[FloatArray, ...]]]:
-    """The sides that a view shows, each with the columns of `ContourSamples` from `pixel` on.
+@njit(cache=True, nogil=True)
+def _contour_lines(
+    line: FloatArray,
+    length: float,
+    radius: float,
+    poses: FloatArray,
+    lenses: FloatArray,
+    sizes: FloatArray,
+    centres: FloatArray,
+    basis: FloatArray,
+    fractions: FloatArray,
+    margin: float,
+) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+    """View, side and position (N,) of the samples that lie within an image, and their columns (N, 7).
 
-    The Jacobian is exact: displacing the surface by d along its outward normal at the contact generator moves the
-    line by d / (depth |l|) pixels, l being the image line of the tangent plane (envelope theorem).
+    These are: pixel (2), outward normal (2), gain, and the displacement of the surface along the outward normal by a
+    step along the basis (2). The gain is exact: displacing the surface by d along its outward normal at the contact
+    generator moves the line by d / (depth |l|) pixels, l being the image line of the tangent plane (envelope theorem).
+
+    Args:
+        line: start and unit direction (2, 3) of the axis.
+        length: of the cylinder [m].
+        radius: of the cylinder [m].
+        poses: camera_from_map (V, 3, 4).
+        lenses: fx, fy, cx, cy (V, 4).
+        sizes: of the images (V, 2).
+        centres: projection centres (V, 3).
+        basis: (2, 3), see `contour_samples`.
+        fractions: of the length (B,).
+        margin: see `contour_samples`.
     """
-    normals = tangent_normals(cylinder, view.centre)
-    if normals is None:
-        return
-    length = cylinder.length
-    rotation = view.camera_from_map[:3, :3]
-    inverse = np.linalg.inv(view.camera.matrix)
-    on_axis = cylinder.start + fractions[:, None] * (length * cylinder.axis)
-    size = np.array([view.camera.width, view.camera.height])
-    for side, normal in enumerate(normals):
-        line = inverse.T @ (rotation @ normal)
-        slope = float(np.hypot(line[0], line[1]))
-        pixel, depth = project(view, on_axis - cylinder.radius * normal)
-        within = (depth > NEAR_PLANE) & (pixel > margin).all(axis=1) & (pixel < size - 1 - margin).all(axis=1)
-        if not within.any() or slope < 1e-12:
+    most = 2 * len(poses) * len(fractions)
+    indices = np.empty((3, most), np.int64)
+    columns = np.empty((most, 7))
+    count = 0
+    start, axis = np.ascontiguousarray(line[0]), np.ascontiguousarray(line[1])
+    for v in range(len(poses)):
+        rotation, shift = np.ascontiguousarray(poses[v, :, :3]), poses[v, :, 3]
+        fx, fy, cx, cy = lenses[v]
+        offset = start - centres[v]
+        offset = offset - axis * (axis * offset).sum()
+        distance = np.sqrt((offset * offset).sum())
+        if distance <= radius * (1.0 + 1e-9):  # within the cylinder
             continue
-        gain = 1.0 / (depth[within] * slope)
-        share = fractions[within]
-        sideways = -(basis @ normal)
-        moves = [(1.0 - share)[:, None] * sideways, share[:, None] * sideways, np.ones((len(share), 1))]
-        jacobian = gain[:, None] * np.concatenate(moves, axis=1)
-        outward = np.broadcast_to(-line[:2] / slope, (len(share), 2))
-        yield side, (pixel[within], outward, (share - 0.5) * length, gain, gain * cylinder.radius, jacobian)
+        towards = offset / distance
+        across = np.cross(axis, towards)
+        sine = radius / distance
+        for side in range(2):
+            sign = 1.0 - 2.0 * side
+            normal = sine * towards + sign * np.sqrt(1.0 - sine * sine) * across
+            turned = rotation @ normal
+            u, w = turned[0] / fx, turned[1] / fy
+            slope = np.hypot(u, w)
+            if slope < 1e-12:
+                continue
+            first = rotation @ (start - radius * normal) + shift
+            along = length * (rotation @ axis)
+            for b in range(len(fractions)):
+                x, y, depth = first + fractions[b] * along
+                if depth <= NEAR_PLANE:
+                    continue
+                px, py = fx * x / depth + cx, fy * y / depth + cy
+                if not (margin < px < sizes[v, 0] - 1 - margin and margin < py < sizes[v, 1] - 1 - margin):
+                    continue
+                indices[:, count] = v, side, b
+                columns[count, 0:2] = px, py
+                columns[count, 2:4] = -u / slope, -w / slope
+                columns[count, 4] = 1.0 / (depth * slope)
+                for k in range(2):
+                    columns[count, 5 + k] = -(basis[k] * normal).sum()
+                count += 1
+    return indices[0, :count].copy(), indices[1, :count].copy(), indices[2, :count].copy(), columns[:count].copy()

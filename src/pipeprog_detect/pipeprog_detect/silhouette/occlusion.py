@@ -49,47 +49,58 @@ def visible(
 ) -> NDArray[np.bool_]:
     """Mask (N,) of the cylinder's samples that neither one of the `others` nor the cloud hides from their view."""
     result = np.ones(len(samples), bool)
+    rows = cylinder_rows(others)
     for index, view in enumerate(views):
         chosen = np.flatnonzero(samples.view == index)
         if len(chosen):
             on_axis = cylinder.middle + samples.along[chosen, None] * cylinder.axis
             depth = (on_axis - view.centre) @ view.camera_from_map[2, :3]
-            result[chosen] = ~hidden_by_cylinders(view, samples.pixel[chosen], depth, others)
+            result[chosen] = ~hidden_by_cylinders(view, samples.pixel[chosen], depth, rows)
             result[chosen] &= ~hidden_by_cloud(view, samples.pixel[chosen], depth - cylinder.radius)
     return result
 
 
-def hidden_by_cylinders(
-    view: View, pixel: FloatArray, depth: FloatArray, others: Sequence[Cylinder]
-) -> NDArray[np.bool_]:
-    """Mask (N,) of points, seen at pixel (N, 2) at depth (N,) [m], behind a cylinder grown by `MARGIN`."""
-    result = np.zeros(len(depth), bool)
-    camera, centre = view.camera, view.centre
+def cylinder_rows(cylinders: Sequence[Cylinder]) -> FloatArray:
+    """Start, axis, length and radius (K, 8) of cylinders, for `hidden_by_cylinders`."""
+    return np.array([[*each.start, *each.axis, each.length, each.radius] for each in cylinders]).reshape(-1, 8)
+
+
+def hidden_by_cylinders(view: View, pixel: FloatArray, depth: FloatArray, cylinders: FloatArray) -> NDArray[np.bool_]:
+    """Mask (N,) of points, seen at pixel (N, 2) at depth (N,) [m], behind one of the cylinders grown by `MARGIN`.
+
+    `cylinders` (K, 8): as `cylinder_rows` gives them.
+    """
+    camera = view.camera
     rays = np.stack(
         [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(depth))], axis=1
     )
-    rays = rays @ view.camera_from_map[:3, :3]
-    for other in others:
-        result |= _passing(other, centre, rays, depth, MARGIN / camera.fx)
-    return result
+    return _passing(cylinders, view.centre, rays @ view.camera_from_map[:3, :3], depth, MARGIN / camera.fx)
 
 
+@njit(cache=True, nogil=True)
 def _passing(
-    other: Cylinder, centre: FloatArray, rays: FloatArray, own_depth: FloatArray, margin: float
+    cylinders: FloatArray, centre: FloatArray, rays: FloatArray, own_depth: FloatArray, margin: float
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of rays (N, 3) with unit depth that meet `other`, grown by `margin` x depth, before `own_depth`."""
-    axis = other.axis
-    offset = other.start - centre
-    offset_across = offset - axis * (axis @ offset)
-    rays_along = rays @ axis
-    rays_across = rays - rays_along[:, None] * axis
-    square = np.maximum(np.einsum("ij,ij->i", rays_across, rays_across), 1e-12)
-    depth = rays_across @ offset_across / square
-    miss = offset_across - depth[:, None] * rays_across
-    along = depth * rays_along - axis @ offset
-    reach = other.radius + margin * np.abs(depth)
-    near = np.einsum("ij,ij->i", miss, miss) < reach**2
-    return near & (depth > 0) & (depth < own_depth) & (along > -reach) & (along < other.length + reach)
+    """Mask (N,) of rays (N, 3) with unit depth that meet a cylinder, grown by `margin` x depth, before `own_depth`."""
+    result = np.zeros(len(rays), np.bool_)
+    for k in range(len(cylinders)):
+        ax, ay, az, length, radius = cylinders[k, 3:8]
+        x, y, z = cylinders[k, 0] - centre[0], cylinders[k, 1] - centre[1], cylinders[k, 2] - centre[2]
+        before = ax * x + ay * y + az * z
+        x, y, z = x - before * ax, y - before * ay, z - before * az
+        for i in range(len(rays)):
+            if result[i]:
+                continue
+            along = rays[i, 0] * ax + rays[i, 1] * ay + rays[i, 2] * az
+            u, v, w = rays[i, 0] - along * ax, rays[i, 1] - along * ay, rays[i, 2] - along * az
+            depth = (u * x + v * y + w * z) / max(u * u + v * v + w * w, 1e-12)
+            if depth <= 0.0 or depth >= own_depth[i]:
+                continue
+            reach = radius + margin * depth
+            miss = (x - depth * u) ** 2 + (y - depth * v) ** 2 + (z - depth * w) ** 2
+            place = depth * along - before
+            result[i] = miss < reach * reach and -reach < place < length + reach
+    return result
 
 
 def hidden_by_cloud(view: View, pixel: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:

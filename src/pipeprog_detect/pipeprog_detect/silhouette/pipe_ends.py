@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +14,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, project
 from pipeprog_detect.silhouette.extension import AxialEvidence, axial_evidence
 from pipeprog_detect.silhouette.limb_edges import LINEAR_LIGHT
-from pipeprog_detect.silhouette.occlusion import hidden_by_cloud, hidden_by_cylinders
+from pipeprog_detect.silhouette.occlusion import cylinder_rows, hidden_by_cloud, hidden_by_cylinders
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 
@@ -93,7 +92,8 @@ def find_end(scene: Scene, at_end: bool, surface_end: float | None) -> End | Non
     pixel = float(np.median([np.linalg.norm(barrel.end - view.centre) for view in scene.views]))
     pixel = pixel / scene.views[0].camera.fx
     along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL, dtype=float)
-    edges = np.concatenate([_slopes(barrel, along, view, scene.others) for view in scene.views])
+    rows = cylinder_rows(scene.others)
+    edges = np.concatenate([_slopes(barrel, along, view, rows) for view in scene.views])
     seen = np.isfinite(edges)
     if not seen.any():
         return None
@@ -134,7 +134,7 @@ def _odds(evidence: AxialEvidence, inside: float) -> tuple[FloatArray, FloatArra
     return position[searched], total[searched]
 
 
-def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: Sequence[Cylinder]) -> FloatArray:
+def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: FloatArray) -> FloatArray:
     """Derivative (SECTORS, T) of the light along the axis at `along` (T,) [m] beyond the end; NaN where unseen."""
     axis, end = barrel.axis, barrel.end
     towards = view.centre - end

@@ -13,7 +13,6 @@ from pipeprog_camera.camera import Camera
 from pipeprog_detect.silhouette.apparent_contour import (
     contour_samples,
     project,
-    tangent_normals,
     views_showing,
 )
 from pipeprog_detect.silhouette.occlusion import visible
@@ -41,10 +40,8 @@ def view_from(centre: np.ndarray, target: np.ndarray) -> View:
 
 def contour_lines(cylinder: Cylinder, view: View) -> FloatArray:
     """The two lines of the contour as image segments (2, 2, 2): [side, end, (x, y)] in pixels."""
-    normals = tangent_normals(cylinder, view.centre)
-    assert normals is not None
-    ends = np.stack([cylinder.start, cylinder.end])
-    return np.stack([project(view, ends - cylinder.radius * normal)[0] for normal in normals])
+    at = contour_samples(cylinder, [view], np.eye(3)[:2], 20.0, margin=-np.inf)
+    return np.stack([at.pixel[at.side == side][[0, -1]] for side in (0, 1)])
 
 
 @given(x=numbers, z=numbers, tilt=numbers, turn=numbers, radius=radii)
@@ -91,7 +88,6 @@ def test_jacobian_is_the_derivative(tilt: float, parameter: int, radius: float) 
 def test_no_contour_from_inside_or_behind() -> None:
     cylinder = Cylinder(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0]), 0.5)
     inside = view_from(np.array([0.1, -0.1, 0.0]), np.array([0.0, 5.0, 0.0]))
-    assert tangent_normals(cylinder, inside.centre) is None
     turned_away = view_from(np.array([0.0, -2.0, 0.0]), np.array([0.0, -5.0, 0.1]))
     basis = frame(cylinder, np.array([0.0, 1.0, 0.0]))
     assert len(contour_samples(cylinder, [inside, turned_away], basis, 20.0)) == 0
