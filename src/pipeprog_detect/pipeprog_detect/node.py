@@ -156,16 +156,14 @@ class DetectNode(Node):
         self._intermediate = bool(self.declare_parameter("intermediate", True).value)
         self._named: dict[str, Cylinder] = {}  # pipes by name, as they were published last
         self._numbers: dict[int, int] = {}  # of the keyframes handed to the worker, by stamp
-        self._left_out: dict[int, str] = {}  # why no map waits for the keyframe of a stamp
+        self._left_out: dict[int, None] = {}  # stamps of keyframes that no map waits for, in their order
         self._waited: dict[int, int] = {}  # ticks, by stamp of the keyframes that the newest map waits for
         self._in_work: ReceivedStatus | None = None  # of the map that the worker has
         self._revision = self._pipes = 0
         self._supervision = Supervision(self._start_worker, "the detection process")
         self._output = PipeOutput(self, boq)
         self._intake = Intake(self)
-        self._keyframes = KeyframeInput(
-            self._intake, self._on_keyframe, lambda stamp: self._leave_out(stamp, "it was dropped")
-        )
+        self._keyframes = KeyframeInput(self._intake, self._on_keyframe, lambda stamp: self._leave_out([stamp]))
         self._maps = MapInput(self._intake, self._hand_over)
         self._finish = FinishService(self, lambda: self._maps.revision, self._on_finish)
         self._diagnostics = Diagnostics(self, "pipes", self._health)
@@ -180,19 +178,20 @@ class DetectNode(Node):
     def _on_keyframe(self, stamp: int, encoded: bytes, camera: Camera, frame_id: str) -> None:
         keyframe = Keyframe(stamp, encoded, camera)
         if self._supervision.is_poison(keyframe):
-            self._leave_out(stamp, "detection processes died of its image")
+            text = f"detection processes died of the image at {stamp} ns before: it is not tried again"
+            self._intake.reject(IMAGES, InvalidMessageError("poison", text))
+            self._leave_out([stamp])
             return
-        self._left_out.pop(stamp, None)
+        self._left_out.pop(stamp, None)  # it was given up too early
         self._numbers[stamp] = self._supervision.keep(keyframe)
         self._hand_over()
 
-    def _leave_out(self, stamp: int, reason: str) -> None:
-        """No map waits for this keyframe any more."""
-        if stamp not in self._numbers:
-            self._left_out[stamp] = reason
-            if len(self._left_out) > MAX_POSES:
-                del self._left_out[next(iter(self._left_out))]
-            self._hand_over()
+    def _leave_out(self, stamps: Iterable[int]) -> None:
+        """No map waits for these keyframes any more."""
+        self._left_out |= dict.fromkeys(stamp for stamp in stamps if stamp not in self._numbers)
+        for stamp in list(self._left_out)[:-MAX_POSES]:
+            del self._left_out[stamp]
+        self._hand_over()
 
     def _missing(self, poses: ReceivedPoses) -> set[int]:
         return set(poses.stamps.tolist()).difference(self._numbers, self._left_out)
@@ -236,11 +235,11 @@ class DetectNode(Node):
         newest = self._maps.newest
         missing = self._missing(newest.poses) if newest is not None else set()
         self._waited = {stamp: self._waited.get(stamp, 0) + 1 for stamp in missing}
-        for stamp in [stamp for stamp, ticks in self._waited.items() if ticks >= PATIENCE]:
+        lost = [stamp for stamp, ticks in self._waited.items() if ticks >= PATIENCE]
+        for stamp in lost:
             text = f"the pose of a keyframe at {stamp} ns has come, its image has not: it is left out"
             self._intake.reject(POSES, InvalidMessageError("no image", text))
-            self._left_out[stamp] = text
-        self._hand_over()
+        self._leave_out(lost)
 
     def _start_worker(self, kept: Iterable[Keyframe]) -> WorkerProcess:
         return WorkerProcess(self, serve, (*self._arguments, kept, self._named), self._on_event, self._on_death)
@@ -252,7 +251,7 @@ class DetectNode(Node):
             self._supervision.in_work = None if event.stamp is None else self._numbers.get(event.stamp)
         elif isinstance(event, KeyframeUnusable):
             self._intake.reject(IMAGES, InvalidMessageError("image", event.problem))
-            self._left_out[event.stamp] = event.problem
+            self._left_out[event.stamp] = None
         else:
             self._supervision.fulfilled()
             if isinstance(event, NoPipes):
@@ -274,7 +273,7 @@ class DetectNode(Node):
         self.get_logger().error(death.report)
         if isinstance(death.dropped, Keyframe):
             del self._numbers[death.dropped.stamp]
-            self._leave_out(death.dropped.stamp, "detection processes died of its image")
+            self._leave_out([death.dropped.stamp])
         if death.failed is not None and self._in_work is not None:
             self._refuse(self._in_work.revision, death.report)
         self._hand_over()
