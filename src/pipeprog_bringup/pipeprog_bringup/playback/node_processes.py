@@ -17,7 +17,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
 import yaml
 
@@ -28,6 +28,8 @@ SHARED_MEMORY = "/dev/shm"
 _SHARED_BYTES = 65536  # LTTng, which rclpy loads, takes two pages; more for the locks of Python's child processes
 _STOP_SECONDS = 3.0
 _PR_SET_PDEATHSIG = 1
+_FALLOC_FL_KEEP_SIZE = 1
+LOG_ROOM = 1 << 16  # bytes; a node says a few lines in a replay, a traceback has 4000 bytes
 _LIBC = ctypes.CDLL(None) if os.name == "posix" else None  # no graph runs elsewhere, but the command loads
 
 
@@ -125,6 +127,7 @@ class Graph:
         arguments = ["--ros-args", "-r", f"__node:={name}", "--params-file", str(file)]
         command = [sys.executable, "-m", self._modules[name], *arguments]
         with self._log(name).open("wb") as log:
+            _set_room_aside(log)
             self._processes[name] = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -154,6 +157,15 @@ class Graph:
     def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
+
+
+def _set_room_aside(log: BinaryIO) -> None:
+    """Takes LOG_ROOM of the disk for a file without changing its length, where the file system can do so.
+
+    The images of a recording may fill the disk that the logs are on, and the node must still say so.
+    """
+    assert _LIBC is not None
+    _LIBC.fallocate(log.fileno(), _FALLOC_FL_KEEP_SIZE, ctypes.c_int64(0), ctypes.c_int64(LOG_ROOM))
 
 
 def _die_with_parent() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipeprog_bringup.playback import node_processes
-from pipeprog_bringup.playback.node_processes import Graph, NodeFailure, require_ros
+from pipeprog_bringup.playback.node_processes import LOG_ROOM, Graph, NodeFailure, require_ros
 from pipeprog_camera.errors import InputError
 
 
@@ -28,6 +28,8 @@ def test_a_node_that_stops_by_itself_is_quoted(tmp_path: Path) -> None:
     assert "stopped with exit code 2" in str(caught.value)
     assert "json.tool: error: " in str(caught.value)
     assert str(tmp_path / "frames.log") in str(caught.value)
+    log = (tmp_path / "frames.log").stat()
+    assert log.st_blocks * 512 >= LOG_ROOM > log.st_size, "room for the last words on a disk that is full by then"
 
 
 def test_a_full_shared_memory_is_told_before_rclpy_ends_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
