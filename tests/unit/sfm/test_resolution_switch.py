@@ -21,13 +21,14 @@ from sitegen.render import Lens, build_scene, render
 from sitegen.sensor import Sensor, develop
 from sitegen.site import BOARD_CENTRES, BOARD_CIRCLE_RADIUS, CONCRETE, PLASTER, SCREED, Site
 
-LARGE = Lens(560, 360, 430.0, 430.0, 279.5, 179.5)
-SMALL = Lens(400, 300, 301.0, 301.0, 199.5, 149.5)  # another aspect, and no whole-numbered ratio
-PLACES = np.linspace(0.9, 2.2, 12)  # of the keyframes along x, m
+LARGE = Lens(420, 270, 322.0, 322.0, 209.5, 134.5)
+SMALL = Lens(330, 240, 247.0, 247.0, 164.5, 119.5)  # another aspect, and no whole-numbered ratio
+PLACES = np.linspace(1.0, 2.0, 10)  # of the keyframes along x, m
+HALF = len(PLACES) // 2
 STEP = 500_000_000  # ns between two keyframes
 DISTANCE = 1.7  # m to the wall
 CONFIG = SfmConfig(
-    mapper=MapperConfig(max_features=1500), stereo=StereoConfig(max_pairs=2), fusion=FusionConfig(voxel=0.01)
+    mapper=MapperConfig(max_features=1000), stereo=StereoConfig(max_pairs=2), fusion=FusionConfig(voxel=0.01)
 )
 
 
@@ -56,7 +57,7 @@ def switched() -> tuple[MetricMap, Reconstruction]:
     reconstruction = Reconstruction(CONFIG, BoardFile((Board("A", BOARD_CIRCLE_RADIUS, centres),)))
     rng = np.random.default_rng(2)
     for number, x in enumerate(PLACES):
-        lens = LARGE if number < len(PLACES) // 2 else SMALL
+        lens = LARGE if number < HALF else SMALL
         rows = np.broadcast_to(world_from_camera(float(x)), (lens.height, 4, 4))
         image = develop(render(scene, lens, rows, edge_bits=2), Sensor(), rng)
         camera = Camera(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
@@ -73,15 +74,15 @@ def test_all_keyframes_are_in_one_map(switched: tuple[MetricMap, Reconstruction]
 def test_the_way_has_its_true_length(switched: tuple[MetricMap, Reconstruction]) -> None:
     found = switched[0].trajectory.map_from_camera[:, :3, 3]
     true = np.array([world_from_camera(float(x))[:3, 3] for x in PLACES])
-    for part in (slice(None), slice(0, 6), slice(6, 12)):
+    for part in (slice(None), slice(0, HALF), slice(HALF, None)):
         lengths = [np.linalg.norm(np.diff(way[part], axis=0), axis=1).sum() for way in (found, true)]
         assert lengths[0] == pytest.approx(lengths[1], rel=0.005)
 
 
 def test_the_board_is_measured_in_images_of_both_sizes(switched: tuple[MetricMap, Reconstruction]) -> None:
     views = np.array(switched[0].scale.views) // STEP
-    assert (views < 6).sum() >= 2
-    assert (views >= 6).sum() >= 2
+    assert (views < HALF).sum() >= 2
+    assert (views >= HALF).sum() >= 2
     assert switched[0].scale.sigma < 0.005
 
 
@@ -91,5 +92,5 @@ def test_the_cloud_has_the_wall_where_it_is(switched: tuple[MetricMap, Reconstru
     wall = points[(np.abs(points[:, 1]) < 0.05) & (points[:, 2] > -0.2)]
     for left, right in ((-1.0, -0.3), (0.3, 1.0)):
         part = wall[(wall[:, 0] > left) & (wall[:, 0] < right)]
-        assert len(part) > 300
+        assert len(part) > 100
         assert np.median(part[:, 1]) == pytest.approx(0.012, abs=0.01)  # the board is 12 mm thick
