@@ -158,8 +158,12 @@ def _facts(request: Request, inputs: _Inputs, outcome: Outcome, timings: dict[st
 
 @contextlib.contextmanager
 def _ros() -> Iterator[None]:
-    """rclpy for this process; Ctrl-C stays Python's KeyboardInterrupt."""
-    rclpy.init(args=["--ros-args", "--log-level", "error"], signal_handler_options=SignalHandlerOptions.NO)
+    """rclpy for this process; Ctrl-C stays Python's KeyboardInterrupt. Raises InputError where ROS does not start."""
+    try:
+        rclpy.init(args=["--ros-args", "--log-level", "error"], signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        reason = str(error).partition(", at /")[0]  # without the line of ROS's source
+        raise InputError(f"ROS 2 does not start: {reason}; look at the environment variables ROS_*") from None
     try:
         yield
     finally:
