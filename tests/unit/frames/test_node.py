@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
@@ -22,6 +23,7 @@ from pipeprog_frames.node import FramesNode
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
+from tests.fuzz.fuzzed_messages import png_header
 
 CAMERA = Camera(640, 360, 450.0, 450.0, 319.5, 179.5)
 START = 1_700_000_000_000_000_000
@@ -294,6 +296,48 @@ def test_a_viewer_is_not_taken_for_the_detector(stage: Callable[..., Stage], wal
     assert not connecting.is_canceled()
     scene.add_node("detect", stage=True)
     scene.spin_until(lambda: scene.keyframes)
+
+
+def test_in_lockstep_every_image_is_decided_on(stage: Callable[..., Stage], wall: NDArray) -> None:
+    """A replay counts decisions: damaged, absurd and uncalibrated images have theirs, and the survey can end."""
+    scene = stage("-p", "lockstep:=true")
+    for name in ("sfm", "detect"):
+        scene.add_node(name, stage=True)
+    scene.others.create_subscription(
+        CompressedImage,
+        "keyframes/image/compressed",
+        lambda message: scene.answer(messages.stamp_ns(message.header.stamp), len(scene.keyframes), []),
+        qos.reliable(50),
+    )
+    hostile = {
+        3: messages.compressed_image(START + 3 * 200_000_000, "camera", png_header(100_000, 100_000)),
+        5: messages.compressed_image(START + 5 * 200_000_000, "camera", png_header(1, 1)),
+        7: messages.compressed_image(START + 7 * 200_000_000, "camera", b""),
+        9: compressed(START + 10**17, view(wall, 720)),
+        11: compressed(START + 10 * 200_000_000, view(wall, 800)),
+        13: compressed(START + 13 * 200_000_000, view(wall, 0)[:180, :320]),
+    }
+    hostile[15] = messages.compressed_image(0, "x" * 300, b"")
+    hostile[15].header.stamp = Time(sec=2**31 - 1, nanosec=2**32 - 1)
+    sent = []
+    for index in range(20):
+        stamp = START + index * 200_000_000
+        image = hostile.get(index, compressed(stamp, view(wall, 80 * index)))
+        sent.append(messages.stamp_ns(image.header.stamp))
+        scene.show(sent[-1], image)
+    finish = scene.others.create_client(Finish, "frames/finish")
+    scene.spin_until(finish.service_is_ready)
+    end = finish.call_async(Finish.Request(expected_inputs=len(sent)))
+    scene.spin_until(end.done)
+    scene.spin_until(lambda: len(scene.decisions) >= len(sent))
+    assert end.result().success
+    assert sorted(messages.stamp_ns(decision.header.stamp) for decision in scene.decisions) == sorted(sent)
+    said = {messages.stamp_ns(decision.header.stamp): decision.reason for decision in scene.decisions}
+    assert [said[sent[index]].partition(":")[0] for index in (3, 5, 7, 9, 11, 13, 15)] == [
+        *("damaged image", "damaged image", "damaged image", "stamp jumps ahead", "stamp repeats"),
+        *("size differs from CameraInfo", "damaged image"),
+    ]
+    assert "300 characters" in said[sent[15]]
 
 
 def test_a_network_takes_a_recording(stage: Callable[..., Stage]) -> None:
