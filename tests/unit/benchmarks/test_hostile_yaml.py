@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""YAML and JSON that do harm: each is used, or refused in one line that names the file."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.hostile_yaml import NAMED, VALID, judged, read_and_use
+from benchmarks.limited import Outcome
+from pipeprog_camera.errors import InputError
+
+
+@pytest.fixture(autouse=True)
+def little_memory() -> Iterator[None]:
+    """Two gigabytes more than are in use."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 31), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.mark.parametrize("kind", VALID)
+def test_a_valid_file_is_used(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"valid.{kind}"
+    path.write_text(VALID[kind])
+    read_and_use(path)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_hostile_file_is_used_or_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    NAMED[name](path)
+    started = time.process_time()
+    refusal = refused(path)
+    assert time.process_time() - started < 10.0  # s; half of what a command may take
+    if refusal:
+        assert judged(path, Outcome("refused", refusal, 0.0, 0)) == ""
+
+
+def refused(path: Path) -> str:
+    """The error of a file, empty where it is used."""
+    try:
+        read_and_use(path)
+    except InputError as error:
+        return str(error)
+    return ""
