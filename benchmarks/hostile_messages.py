@@ -240,16 +240,22 @@ def set_absurd_parameters(peer: Peer) -> list[str]:
     return taken
 
 
-def absurd_finish(peer: Peer, node: str) -> str:
-    """The answer to a request that expects more inputs than can come."""
-    answer = peer.call(srv.Finish, f"{node}/finish", srv.Finish.Request(expected_inputs=2**32 - 1))
-    return str(answer.message)
+def absurd_finish(peer: Peer) -> dict[str, str]:
+    """The nodes' answers to a request that expects more inputs than can come."""
+    request = srv.Finish.Request(expected_inputs=2**32 - 1)
+    clients = {name: peer.node.create_client(srv.Finish, f"{name}/finish") for name in NODE_MODULES}
+    peer.wait_for(lambda: all(client.service_is_ready() for client in clients.values()))
+    answers = {name: client.call_async(request) for name, client in clients.items()}
+    peer.wait_for(lambda: all(answer.done() for answer in answers.values()))
+    return {name: answer.result().message for name, answer in answers.items()}
 
 
 def survey(peer: Peer) -> list[msg.Pipe]:
     """Plays the recording and finishes the survey; its pipes."""
-    peer.wait_for(lambda: peer.values["frames"]["queued"] == peer.values["sfm"]["waiting"] == "0")
-    considered = int(peer.values["frames"]["frames considered"])
+    peer.wait_for(lambda: peer.values["sfm"]["waiting"] == "0")
+    peer.spin(2.0)  # two diagnostics
+    # An image of the attack may wait there for a calibration of its size.
+    received = int(peer.values["frames"]["frames considered"]) + int(peer.values["frames"]["queued"])
     frames = list(Bag.open(DEMO.bag))
     stamps = {frame.stamp for frame in frames}
     for number, frame in enumerate(frames, start=1):
@@ -259,7 +265,7 @@ def survey(peer: Peer) -> list[msg.Pipe]:
         peer.publish("image/compressed", frame.data)
         peer.wait_for(lambda: number - len(stamps & peer.decided) < IN_FLIGHT)  # noqa: B023 - called at once
         peer.wait_for(lambda: peer.keyframes & stamps <= peer.answered)
-    _finish(peer, "frames", considered + len(frames))
+    _finish(peer, "frames", received + len(frames))
     peer.wait_for(lambda: peer.keyframes & stamps <= peer.answered)
     revision = _finish(peer, "sfm", 0)
     _finish(peer, "detect", revision)
@@ -330,7 +336,7 @@ def main() -> None:
     with live(out / "attacked") as peer:
         told = attack(peer, arguments.count, arguments.seed)
         told["parameters that took an absurd value"] = set_absurd_parameters(peer)
-        told["answers to an absurd Finish"] = {name: absurd_finish(peer, name) for name in NODE_MODULES}
+        told["answers to an absurd Finish"] = absurd_finish(peer)
         missing, worst_bytes = peer.graph.without_worker, peer.graph.worst_bytes
         restarted = {name: len(seen) - 1 for name, seen in peer.graph.workers.items()}
         worst_seconds, attacked, ended = peer.worst_seconds, survey(peer), peer.graph.ended
