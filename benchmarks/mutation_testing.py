@@ -137,22 +137,22 @@ MUTANTS = {
         "detect/product/test_boq.py",
     ),
     "detector's node: no DELETEALL before the markers": Mutant(
-        "pipeprog_detect.node.DetectNode._on_event",
+        "pipeprog_detect.node.PipeOutput.publish",
         "[Marker(header=header, action=Marker.DELETEALL)]",
         "[]",
         "detect/test_node.py",
     ),
     "detector's node: stamp of the newest status on the pipes": Mutant(
-        "pipeprog_detect.node.DetectNode._on_event",
-        "messages.stamp_ns(status.map_stamp)",
-        "messages.stamp_ns(status.header.stamp)",
+        "pipeprog_node.received.sfm_status",
+        "checked_stamp(message.map_stamp)",
+        "checked_stamp(message.header.stamp)",
         "detect/test_node.py",
     ),
     "node: latched topics are volatile": Mutant(
         "pipeprog_node.qos.latched", "kept(1)", "reliable(1)", "node/test_qos.py"
     ),
     "node: nanoseconds of a stamp dropped": Mutant(
-        "pipeprog_node.messages.time_msg", "nanosec=stamp % _SECOND", "nanosec=0", "node/test_messages.py"
+        "pipeprog_node.messages.time_msg", "nanosec=stamp - sec * SECOND", "nanosec=0", "node/test_messages.py"
     ),
     "bringup: the mean of the errors for their root mean square": Mutant(
         "pipeprog_bringup.results.scoring._rms",
