@@ -17,6 +17,7 @@ import trimesh
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.cloud_io import write_ply
 from pipeprog_bringup.results.results_reader import UNPLANNED
+from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe
 
@@ -33,7 +34,8 @@ def folder(tmp_path: Path) -> Path:
     """Results of two pipes before a wall, seen from two places."""
     folder = tmp_path / "results"
     folder.mkdir()
-    result_files.write_pipes(folder / "pipes.json", Product(PIPES, [], []), result_files.Scale("board", 4e-4))
+    classes = [ClassProgress("DN65", 0.0365, 3.0, 1.5, 50.0)]
+    result_files.write_pipes(folder / "pipes.json", Product(PIPES, classes, []), result_files.Scale("board", 4e-4))
     result_files.write_config(folder / "config.yaml", {"boq": [{"name": "DN65", "color": "#0000ff"}]})
     places, turns = np.array([[0.0, -2, 1], [0.5, -2, 1]]), np.array([[-0.7071, 0, 0, 0.7071]] * 2)
     result_files.write_trajectory(folder / "trajectory.tum", [1, 2], places, turns)
