@@ -322,7 +322,7 @@ def live(folder: Path) -> Iterator[Peer]:
             peer.connect()
             yield peer
         finally:
-            rclpy.shutdown()
+            rclpy.try_shutdown()
             graph.stop()
 
 

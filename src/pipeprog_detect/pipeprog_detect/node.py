@@ -46,7 +46,7 @@ from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import IMAGES, KeyframeInput
 from pipeprog_node.main import run
-from pipeprog_node.parameters import declare
+from pipeprog_node.parameters import declare, declare_fixed
 from pipeprog_node.received import ReceivedCloud, ReceivedPoses, ReceivedStatus
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
@@ -148,12 +148,12 @@ class DetectNode(Node):
     def __init__(self) -> None:
         super().__init__("detect")
         config = declare(self, DetectConfig, extra=("boq", "intermediate"))
-        path = str(self.declare_parameter("boq", "").value)
+        path = declare_fixed(self, "boq", "", "file of the bill of quantities")
         if not path:
             raise InputError("no bill of quantities: set the parameter boq to its file")
         boq = load_boq(path)
         self._arguments = config, boq
-        self._intermediate = bool(self.declare_parameter("intermediate", True).value)
+        self._intermediate = declare_fixed(self, "intermediate", True, "detect in every map, not in the last one alone")
         self._named: dict[str, Cylinder] = {}  # pipes by name, as they were published last
         self._numbers: dict[int, int] = {}  # of the keyframes handed to the worker, by stamp
         self._left_out: dict[int, None] = {}  # stamps of keyframes that no map waits for, in their order

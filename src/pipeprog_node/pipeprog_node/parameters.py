@@ -7,13 +7,16 @@ from collections.abc import Collection
 from typing import TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.outside_text import shown
 from pipeprog_node.settings import Setting, build, check, describe, unknown
 
 Config = TypeVar("Config")
+Fixed = TypeVar("Fixed", bool, str)
 
 # Parameters that rclpy itself declares, and prefixes of those that it reads.
 _OF_ROS = ("use_sim_time", "start_type_description_service")
@@ -49,6 +52,23 @@ def declare(node: Node, config_type: type[Config], extra: Collection[str] = ()) 
         initial = _TYPES[setting.type] if setting.default is None else setting.default
         node.declare_parameter(setting.name, initial, _descriptor(setting))
     return build(config_type, values)
+
+
+def declare_fixed(node: Node, name: str, default: Fixed, description: str) -> Fixed:
+    """Declares a parameter that is no setting (a file, how the node is run); it is read at the start alone.
+
+    Raises InputError for a value of another type than the default.
+    """
+    descriptor = ParameterDescriptor(description=description, read_only=True)
+    try:
+        value: Fixed = node.declare_parameter(name, default, descriptor).value
+    except InvalidParameterTypeException:
+        given = shown(node._parameter_overrides[name].value)
+        kind = "true or false" if isinstance(default, bool) else "text"
+        raise InputError(
+            f"parameter of node {node.get_fully_qualified_name()}: {name} = {given}: it takes {kind}"
+        ) from None
+    return value
 
 
 def _descriptor(setting: Setting) -> ParameterDescriptor:

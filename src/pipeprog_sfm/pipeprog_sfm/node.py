@@ -30,7 +30,7 @@ from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import KeyframeInput
 from pipeprog_node.main import run
-from pipeprog_node.parameters import declare
+from pipeprog_node.parameters import declare, declare_fixed
 from pipeprog_node.received import (
     ReceivedAcceleration,
     ReceivedRetirement,
@@ -234,10 +234,10 @@ class SfmNode(Node):
     def __init__(self) -> None:
         super().__init__("sfm")
         config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep"))
-        board = str(self.declare_parameter("board", "").value)
+        board = declare_fixed(self, "board", "", "file of the boards on site")
         self._arguments = config, load_board_file(board) if board else BoardFile()
-        self._colmap = str(self.declare_parameter("colmap", "").value)
-        self._lockstep = bool(self.declare_parameter("lockstep", False).value)
+        self._colmap = declare_fixed(self, "colmap", "", "folder for the sparse model")
+        self._lockstep = declare_fixed(self, "lockstep", False, "every message counts, as in a replay")
         self._supervision = Supervision(self._start_worker, "the reconstruction process")
         self._done = self._dropped = self._retired = 0  # keyframes answered, keyframes left out, Retires answered
         self._output = MapOutput(self)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import pytest
 import rclpy
@@ -15,7 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from pipeprog_camera.errors import InputError
-from pipeprog_node.parameters import declare
+from pipeprog_node.parameters import declare, declare_fixed
 
 
 @dataclass(frozen=True)
@@ -128,3 +129,25 @@ def test_missing_parameter_file_is_reported_without_traceback() -> None:
     assert process.returncode == 1
     assert "missing.yaml" in process.stderr
     assert "Traceback" not in process.stderr
+
+
+def test_a_fixed_parameter_keeps_the_value_of_the_start() -> None:
+    node = Node("fixed", parameter_overrides=[Parameter("board", value="site.yaml")])
+    try:
+        assert declare_fixed(node, "board", "", "file of the boards") == "site.yaml"
+        assert declare_fixed(node, "lockstep", False, "how it is run") is False
+        results = node.set_parameters([Parameter("board", value="other.yaml"), Parameter("lockstep", value=True)])
+        assert not any(result.successful for result in results)
+        assert node.get_parameter("board").value == "site.yaml"
+    finally:
+        node.destroy_node()
+
+
+@pytest.mark.parametrize(("name", "default", "given"), [("board", "", 5), ("lockstep", False, "yes")])
+def test_a_fixed_parameter_of_another_type_is_an_input_error(name: str, default: Any, given: object) -> None:
+    node = Node("fixed", parameter_overrides=[Parameter(name, value=given)])
+    try:
+        with pytest.raises(InputError, match=f"{name} = .*{given}"):
+            declare_fixed(node, name, default, "")
+    finally:
+        node.destroy_node()
