@@ -44,6 +44,9 @@ from pipeprog_node import messages, qos
 from tests.fuzz.fuzzed_messages import fuzzed_stream, good_messages
 
 PATIENCE = 300.0  # s for what takes seconds on an idle machine
+ACKNOWLEDGED = 5.0  # s that an acknowledgement may take; the middleware gives up some damaged bytes without one
+BETWEEN_WAITS = 20  # messages on each topic between two waits for the nodes to have worked them off
+PAUSE = 0.02  # s after a message on each topic: a node takes some milliseconds for its own
 IN_FLIGHT = 10  # frames of the recording that are sent and not decided on
 FROM_OUTSIDE = ("camera_info", "image/compressed", "image", "odometry", "imu", "/tf", "/tf_static")
 WITH_WORKERS = ("sfm", "detect")
@@ -119,6 +122,7 @@ class Peer:
         self.keyframes: set[int] = set()
         self.answered: set[int] = set()
         self.pipes: dict[int, list[msg.Pipe]] = {}  # by revision of the map
+        self.unacknowledged: Counter[str] = Counter()  # waits for a topic's acknowledgements that were given up
         self.worst_seconds = 0.0  # from a message to the answer of the slowest node
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
@@ -152,8 +156,9 @@ class Peer:
     def settle(self) -> None:
         """Returns when every node has taken what was published."""
         started = time.perf_counter()
-        for publisher in self._publishers.values():
-            publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
+        for topic, publisher in self._publishers.items():
+            if not publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGED)):
+                self.unacknowledged[topic] += 1
         # An executor works off its subscriptions before its services.
         answers = [probe.call_async(GetParameters.Request(names=["use_sim_time"])) for probe in self._probes.values()]
         self.wait_for(lambda: all(answer.done() for answer in answers))
@@ -177,6 +182,12 @@ class Peer:
             if time.monotonic() > deadline:
                 raise RuntimeError("waited in vain")
             self._executor.spin_once(timeout_sec=0.1)
+
+    def pause(self) -> None:
+        """Hears what comes for `PAUSE`."""
+        until = time.monotonic() + PAUSE
+        while (left := until - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
 
     def spin(self, seconds: float) -> None:
         """Hears what comes for a time [s]."""
@@ -210,7 +221,9 @@ def attack(peer: Peer, count: int, seed: int) -> dict[str, Any]:
             fuzzed = next(stream)
             kinds[fuzzed.kind] += 1
             peer.publish(topic, fuzzed.content)
-        peer.settle()
+        peer.pause()
+        if number % BETWEEN_WAITS == BETWEEN_WAITS - 1:
+            peer.settle()
         if number % 100 == 99:
             print(f"{number + 1} of {count} on each of {len(streams)} topics", flush=True)
             _ = peer.graph.without_worker  # notes the workers that are there
@@ -219,6 +232,7 @@ def attack(peer: Peer, count: int, seed: int) -> dict[str, Any]:
     return {
         "sent": dict.fromkeys(streams, count),
         "sent of each kind": dict(sorted(kinds.items())),
+        "waits for acknowledgements given up": dict(peer.unacknowledged),
         "dropped": {node: _dropped(values) for node, values in peer.values.items()},
     }
 
