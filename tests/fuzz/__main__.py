@@ -32,7 +32,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=600.0, help="for all targets together")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--repeat", type=Path, metavar="FILE", help="read this input of an earlier failure again")
-    parser.add_argument("--record", action="store_true", help="write benchmarks/results/hostile_fuzz.json")
+    parser.add_argument("--record", action="store_true", help="write benchmarks/results/hostile_fuzz_SEED.json")
     arguments = parser.parse_args()
     if arguments.repeat:
         problem = read_limited(targets()[_name_of(arguments.repeat)], arguments.repeat)
@@ -85,7 +85,7 @@ def _record(outcomes: dict[str, Outcome], arguments: argparse.Namespace) -> None
         "worst_seconds": round(max(outcome.worst_seconds for outcome in outcomes.values()), 2),
         "worst_bytes": max(outcome.worst_bytes for outcome in outcomes.values()),
     }
-    (RESULTS / "hostile_fuzz.json").write_text(json.dumps(content, indent=1) + "\n")
+    (RESULTS / f"hostile_fuzz_{arguments.seed}.json").write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":
