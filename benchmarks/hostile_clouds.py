@@ -25,6 +25,7 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads do not survive a fork
 
 import laspy
+import lazrs
 import numpy as np
 import pye57
 from plyfile import PlyData, PlyElement
@@ -41,6 +42,7 @@ SECONDS, MEMORY = 20.0, 1 << 31
 WHAT = "Point clouds (PLY, PCD, LAS, LAZ, E57, text) that are damaged or declare what they do not hold"
 COUNT = 400  # points of a valid cloud
 HUGE = (0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
+LAYERS = 8 + 30 + 4  # bytes from the start of a LAZ's points: position of the table, first point, number of points
 PAGE, PAYLOAD = 1024, 1020  # bytes of an E57's page, and those without its checksum
 
 
@@ -75,6 +77,43 @@ def _las(path: Path, version: str = "1.4", point_format: int = 6) -> None:
     las.write(path)
 
 
+def _las_in_chunks(path: Path) -> None:
+    """A LAZ whose chunks have sizes of their own, 100 points and 300."""
+    _las(path)
+    content = path.read_bytes()
+    start, at = struct.unpack_from("<I", content, 96)[0], content.index(b"laszip encoded") - 2 + 54
+    compression = lazrs.LazVlr.new_for_compression(6, 0, True)
+    description = compression.record_data()
+    points = laspy.read(path).points.array.tobytes()
+    first = 100 * compression.item_size()
+    with path.open("r+b") as stream:
+        stream.seek(at)
+        stream.write(description)
+        stream.seek(start)
+        stream.truncate()
+        compressor = lazrs.LasZipCompressor(stream, compression)
+        compressor.compress_many(points[:first])
+        compressor.finish_current_chunk()
+        compressor.compress_many(points[first:])
+        compressor.done()
+
+
+def _endless_time(path: Path) -> None:
+    """A LAZ whose compressed bits say, again and again, that the time is one of another sequence.
+
+    Of all symbols the last follows as long as the coded value is the interval's length less one; the decoder calls
+    itself for each and has no stack left.
+    """
+    _las(path, "1.2", 1)
+    content = path.read_bytes()
+    start = struct.unpack_from("<I", content, 96)[0]
+    table = struct.unpack_from("<q", content, start)[0]
+    chunk = content[start + 8 : start + 36] + b"\xff\xff\xff\xfe"
+    path.write_bytes(content[:start] + content[start : start + 8] + chunk.ljust(table - start - 8, b"\xff"))
+    with path.open("ab") as stream:
+        stream.write(content[table:])
+
+
 def _e57(path: Path) -> None:
     file = pye57.E57(str(path), mode="w")
     file.write_scan_raw({f"cartesian{axis}": pipe()[:, i].copy() for i, axis in enumerate("XYZ")})
@@ -96,6 +135,7 @@ VALID: dict[str, Callable[[Path], None]] = {
     "old.las": lambda path: _las(path, "1.2", 3),
     "new.laz": _las,
     "old.laz": lambda path: _las(path, "1.2", 3),
+    "chunks.laz": _las_in_chunks,
     "scan.e57": _e57,
     "points.xyz": _text,
     "points.csv": lambda path: _text(path, "x,y,z\n", ","),
@@ -161,6 +201,18 @@ def in_points(offset: int, kind: str, value: int) -> Callable[[Path], None]:
         start = struct.unpack_from("<I", content, 96)[0]
         struct.pack_into("<" + kind, content, start + offset, value)
         path.write_bytes(content)
+
+    return write
+
+
+def with_longer_layer(more: int) -> Callable[[Path], None]:
+    """A LAZ whose chunk declares its first layer longer by so many bytes."""
+
+    def write(path: Path) -> None:
+        _las(path)
+        content = path.read_bytes()
+        at = struct.unpack_from("<I", content, 96)[0] + LAYERS
+        in_points(LAYERS, "I", struct.unpack_from("<I", content, at)[0] + more)(path)
 
     return write
 
@@ -385,9 +437,19 @@ NAMED: dict[str, Callable[[Path], None]] = {
     "chunks of no points.laz": in_compression(12, "I", 0),
     "chunks of their own sizes.laz": in_compression(12, "I", 2**32 - 1),
     "chunks of 2 points.laz": in_compression(12, "I", 2),
+    "chunks of two billion points.laz": in_compression(12, "I", 0x8000C350),
+    "chunks of four billion points.laz": in_compression(12, "I", 2**32 - 2),
+    "a layer of 4 GB.laz": in_points(LAYERS, "I", 2**32 - 1),
+    "a last layer of 4 GB.laz": in_points(LAYERS + 8 * 4, "I", 2**32 - 1),
+    "a layer one byte too long.laz": with_longer_layer(1),
+    "a time without end.laz": _endless_time,
+    "one point too many for its chunks.laz": patched(_las_in_chunks, (247, "Q", COUNT + 1)),
+    "the bit of an old LASzip.laz": patched(_las, (104, "B", 0xC6)),
+    "compressor of one chunk.laz": in_compression(0, "H", 1),
     "compressor 99.laz": in_compression(0, "H", 99),
     "items of no number.laz": in_compression(32, "H", 0),
     "items of 16 bits.laz": in_compression(32, "H", 65535),
+    "item of another type.laz": in_compression(34, "H", 6),
     "item of an unknown type.laz": in_compression(34, "H", 999),
     "item of 65535 bytes.laz": in_compression(36, "H", 65535),
     "cut in its points.laz": cut(_las, 0.7),

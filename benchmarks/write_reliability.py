@@ -24,6 +24,7 @@ DOOR = """## What comes in
 
 A file is compared with limits before it is opened further: its size, the sizes that it declares for chunks, images and clouds, the depth and number of its values.
 What cannot be used ends the command with one sentence that names the file, the value and the remedy; a damaged recording gives what is still whole in it.
+LAZ is decompressed in a process of its own: its decoder recurses as deep as the compressed bits say, which no check of sizes bounds.
 
 A node has one door, `pipeprog_node.intake.Intake`.
 Each type of message is checked in one function of `pipeprog_node.received`: finite numbers, sizes that fit their data, unit quaternions, counts, stamps that are times, the size of an image from its header before a pixel is decoded.
@@ -64,6 +65,8 @@ OPEN = (
     "Damaged CDR bytes are dropped by the middleware (Fast DDS), which writes lines to stderr and counts nothing.",
     "What ends a worker by its sheer size costs the time until the machine is out of memory: limits are for one "
     "message, not for what all of them add up to.",
+    "The native decoders of images, recordings and E57 run in the process that reads: what ends one ends the command "
+    "or the worker, and nothing but what was tried here says that no file does.",
     "The fuzzer follows no coverage, and its recordings are small.",
 )
 

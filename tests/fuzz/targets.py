@@ -230,10 +230,11 @@ def _write_clouds(suffix: str, folder: Path, points: np.ndarray) -> Iterator[Pat
             PointCloud.from_xyzi_points(np.c_[points, np.ones(len(points))]).save(path, encoding=encoding)
             yield path
     elif suffix in ("las", "laz"):
-        las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
-        las.x, las.y, las.z = points.T
-        las.write(path)
-        yield path
+        for point_format, version in ((3, "1.2"), (7, "1.4")):  # compressed as one stream, and in layers
+            las = laspy.LasData(laspy.LasHeader(point_format=point_format, version=version))
+            las.x, las.y, las.z = points.T
+            las.write(path)
+            yield path
     elif suffix == "e57":
         file = pye57.E57(str(path), mode="w")
         file.write_scan_raw({f"cartesian{axis}": points[:, i].copy() for i, axis in enumerate("XYZ")})

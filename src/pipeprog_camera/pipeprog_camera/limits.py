@@ -32,6 +32,8 @@ MAX_COORDINATE = 1e8  # m; beyond the coordinates of any map projection (UTM: 1e
 # Files of clouds.
 MAX_CLOUD_POINTS_PER_BYTE = 8  # a bit a point: half a millimetre of noise alone takes 2 bits of each coordinate
 MAX_CLOUD_RECORDS = 1 << 31  # bytes that are unpacked at once; 32 for each point at MAX_CLOUD_POINTS
+MAX_CLOUD_CHUNKS = 1 << 15  # of a LAZ file, half a millisecond each; 2048 points each at MAX_CLOUD_POINTS
+MAX_COMPRESSED_POINT = 2048  # bytes of a LAZ point; lazrs keeps 10 kB for each byte, once a processor
 MAX_CLOUD_HEADER = 1 << 16  # bytes; the headers of PLY and PCD have a line for each column and a few comments
 MAX_CLOUD_LINE = 1 << 16  # characters of a point in text; 1000 columns of a table
 MAX_CLOUD_DESCRIPTION = 1 << 26  # bytes of XML in an E57; 5 kB for each scan and picture: 10 000 of them

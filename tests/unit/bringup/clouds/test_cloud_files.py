@@ -11,11 +11,12 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
 from benchmarks.hostile_clouds import NAMED, VALID, pcd_head, pipe, ply_head
-from pipeprog_bringup.clouds import columns
+from pipeprog_bringup.clouds import columns, laz, laz_decoder
 from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_COORDINATE
@@ -33,6 +34,8 @@ READABLE = {
     "extended records beyond the file.las": (400, 0),
     "version 9.9.las": (400, 0),
     "scale of 1e300.las": None,
+    "chunks of two billion points.laz": (400, 0),
+    "chunks of four billion points.laz": (400, 0),
     "numbers of 5000 digits.xyz": (1, 1),
     "1e400.xyz": (1, 1),
 }
@@ -99,6 +102,41 @@ def test_the_limit_of_a_line_is_the_first_that_is_refused(tmp_path: Path) -> Non
                 continue
             with pytest.raises(InputError, match="one point a line"):
                 read_cloud(path)
+
+
+def test_what_ends_the_decoder_of_a_laz_does_not_end_its_reader(tmp_path: Path) -> None:
+    NAMED["a time without end.laz"](tmp_path / "endless.laz")
+    with pytest.raises(InputError, match="SIGSEGV"):
+        read_cloud(tmp_path / "endless.laz")
+
+
+def test_the_limit_of_a_compressed_point_is_the_last_that_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    VALID["new.laz"](tmp_path / "points.laz")
+    monkeypatch.setattr(laz, "MAX_COMPRESSED_POINT", 30)
+    assert len(read_cloud(tmp_path / "points.laz").cloud.points) == 400
+    monkeypatch.setattr(laz, "MAX_COMPRESSED_POINT", 29)
+    with pytest.raises(InputError, match="29 at most"):
+        read_cloud(tmp_path / "points.laz")
+
+
+def test_limits_of_chunks_are_the_last_that_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    VALID["chunks.laz"](tmp_path / "chunks.laz")
+    with laspy.open(tmp_path / "chunks.laz") as file:
+        description = file.header.vlrs.get("LasZipVlr")[0].record_data
+        start = file.header.offset_to_point_data
+    packed = laz_decoder.Packed(str(tmp_path / "chunks.laz"), 400, 30, start, description, 9)
+    limits = {"MAX_CLOUD_CHUNKS": 2, "MAX_CLOUD_RECORDS": 300 * 30}
+    for name, value in limits.items():
+        monkeypatch.setattr(laz_decoder, name, value)
+    with (tmp_path / "chunks.laz").open("rb") as stream:
+        assert [points for points, _ in laz_decoder.wanted_chunks(packed, stream)] == [100, 300]
+        for name, value in limits.items():
+            with monkeypatch.context() as lower:
+                lower.setattr(laz_decoder, name, value - 1)
+                with pytest.raises(InputError, match="damaged"):
+                    laz_decoder.wanted_chunks(packed, stream)
 
 
 def test_ctrl_c_ends_the_reading_of_a_long_text(tmp_path: Path) -> None:
