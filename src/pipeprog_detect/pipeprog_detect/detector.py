@@ -151,7 +151,7 @@ def detect_outside(
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(prepared.points, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
-    return _abutted(joined(measured), around, judging)
+    return _abutted(joined(measured, judging), around, judging)
 
 
 def _candidates(

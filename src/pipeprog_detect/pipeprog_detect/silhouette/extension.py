@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
 from pipeprog_detect.silhouette.edge_support import SupportProfile
+from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder
@@ -147,7 +148,7 @@ def _turned(known: AdjustedCylinder, held: FloatArray) -> Scene | None:
 def extended(scene: Scene) -> Cylinder:
     """The scene's cylinder, as long as its contour is seen; the same one where nothing is to be added.
 
-    Where something hides the pipe there is no evidence against it.
+    Where something hides the pipe there is no evidence against it; where the views see through it, it ends.
     """
     cylinder = scene.cylinder
     ahead = min(AHEAD * cylinder.length, FARTHEST)
@@ -155,7 +156,11 @@ def extended(scene: Scene) -> Cylinder:
     for at_end in (False, True):
         evidence = axial_evidence(scene, at_end, ahead)
         further = 0.0 if evidence is None else _further(evidence, max(CLAMP_RADII * cylinder.radius, CLAMP))
-        ends.append(cylinder.end + further * cylinder.axis if at_end else cylinder.start - further * cylinder.axis)
+        end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
+        if further:
+            free = free_stretches(Cylinder(end, end + further * out, cylinder.radius), scene.views, scene.others)
+            further = min([further, *(first for first, _ in free)])
+        ends.append(end + further * out)
     return Cylinder(ends[0], ends[1], cylinder.radius)
 
 

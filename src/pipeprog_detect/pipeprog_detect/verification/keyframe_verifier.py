@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
+from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter
@@ -22,6 +24,8 @@ from pipeprog_detect.verification.radius_agreement import agree, contradict, is_
 FEW_VIEWS = 30
 # Points along an axis by which the views that show it are found.
 AXIS_POINTS = 9
+# A piece of a pipe is at least as long as it is wide, in radii: shorter ones are edges of what the views see through.
+SHORTEST_PIECE = 2.0
 # A candidate is verified once: another one within this share of its radius and length gets the same answer.
 SAME = 0.1
 
@@ -68,10 +72,31 @@ class KeyframeVerifier:
         for number in order:
             others = [cylinder for other, cylinder in current.items() if other != number]
             measured = self._measured(candidates[number], others, trusted[number])
-            if measured is not None and not is_known(measured.cylinder, [known.cylinder for known in found]):
-                current[number] = measured.cylinder
-                found.append(measured)
+            if measured is None or is_known(measured.cylinder, [known.cylinder for known in found]):
+                continue
+            pieces = self._pieces(measured, others, trusted[number])
+            if pieces:
+                current[number] = pieces[0].cylinder
+            found += pieces
         return found
+
+    def _pieces(self, measured: MeasuredPipe, others: Sequence[Cylinder], trusted: bool) -> list[MeasuredPipe]:
+        """The pipe itself, or what lies between the stretches at which the views see through it, measured anew."""
+        whole = measured.cylinder
+        free = free_stretches(whole, self._views, others)
+        if not free:
+            return [measured]
+        bounds = [0.0, *(end for stretch in free for end in stretch), whole.length]
+        pieces = []
+        for low, high in zip(bounds[::2], bounds[1::2], strict=True):
+            if high - low > SHORTEST_PIECE * whole.radius:
+                share = (high - low) / whole.length
+                points = int(share * measured.candidate.points)
+                candidate = replace(measured.candidate, cylinder=whole.cut(low, high), points=points)
+                piece = self._measured(candidate, others, trusted)
+                if piece is not None:
+                    pieces.append(piece)
+        return pieces
 
     def _measured(self, candidate: Candidate, others: Sequence[Cylinder], trusted: bool) -> MeasuredPipe | None:
         """The pipe that cloud and keyframes make of a candidate; None where they make none.

@@ -13,11 +13,14 @@ from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.cloud.collinear import join, spanning
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
+from pipeprog_detect.silhouette.free_space import SHORTEST, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 
 # What the cloud does not resolve is no pipe if it is shorter than this many radii: hangers and clamps are.
 SLENDER = 20.0
+# Pieces of one pipe have one radius, to four standard deviations and the tolerance of manufacture (1 %, EN 10255).
+SAME_RADIUS, MANUFACTURE = 4.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -44,10 +47,13 @@ class MeasuredPipe:
         return cls(candidate, candidate.cylinder.cut_like(fit.cylinder), sigma)
 
 
-def joined(measured: Sequence[MeasuredPipe]) -> list[MeasuredPipe]:
-    """The pipes with collinear pieces joined; the radius is that of the piece with the least standard deviation."""
+def joined(measured: Sequence[MeasuredPipe], views: Sequence[View]) -> list[MeasuredPipe]:
+    """The pipes with collinear pieces joined; the radius is that of the piece with the least standard deviation.
+
+    Pieces of two radii are two pipes, and so are those between which the views see what is behind them.
+    """
     whole = []
-    for pieces in join([each.cylinder for each in measured]):
+    for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views):
         best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
         cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
         points = sum(measured[piece].candidate.points for piece in pieces)
@@ -59,6 +65,36 @@ def joined(measured: Sequence[MeasuredPipe]) -> list[MeasuredPipe]:
         candidate, rims = replace(measured[best].candidate, points=points), (along[0][1], along[-1][1])
         whole.append(MeasuredPipe(candidate, cylinder, measured[best].radius_sigma, rims))
     return whole
+
+
+def _without_gaps(
+    groups: Sequence[Sequence[int]], measured: Sequence[MeasuredPipe], views: Sequence[View]
+) -> list[list[int]]:
+    """The groups of collinear pieces, parted where two neighbours on the axis are not one pipe."""
+    parted = []
+    for group in groups:
+        axis = measured[group[0]].cylinder.axis
+        ordered = sorted(group, key=lambda piece: float(measured[piece].cylinder.middle @ axis))
+        part = [ordered[0]]
+        for piece in ordered[1:]:
+            if not _continues(measured[part[-1]], measured[piece], views):
+                parted.append(part)
+                part = []
+            part.append(piece)
+        parted.append(part)
+    return parted
+
+
+def _continues(one: MeasuredPipe, other: MeasuredPipe, views: Sequence[View]) -> bool:
+    """Whether two collinear pieces may be one pipe: of one radius, and nothing is seen through the gap between them."""
+    sigma = float(np.hypot(one.radius_sigma, other.radius_sigma))
+    allowed = SAME_RADIUS * sigma + MANUFACTURE * one.cylinder.radius
+    if abs(one.cylinder.radius - other.cylinder.radius) > allowed:
+        return False
+    ends = [(a, b) for a in (one.cylinder.start, one.cylinder.end) for b in (other.cylinder.start, other.cylinder.end)]
+    start, end = min(ends, key=lambda pair: float(np.linalg.norm(pair[0] - pair[1])))
+    gap = Cylinder(start, end, one.cylinder.radius)
+    return gap.length <= SHORTEST or not free_stretches(gap, views, [])
 
 
 def is_stub(cylinder: Cylinder) -> bool:

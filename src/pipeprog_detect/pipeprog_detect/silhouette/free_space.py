@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the keyframes see through a cylinder: what they show behind its axis proves that no pipe is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.silhouette.apparent_contour import in_image, project
+from pipeprog_detect.silhouette.occlusion import BEFORE, cylinder_rows, hidden_by_cylinders
+from pipeprog_detect.types import Cylinder, View
+
+# Distance [m] between the positions looked at: less than a cell of a view's depths (8 px: 16 mm at 2 m with 1000 px).
+STEP = 0.01
+# A position is free where at least three views, and more than half of those that look at it, see what is behind it:
+# stereo is wrong in one view, not in three from different places.
+MIN_VIEWS, MIN_SHARE = 3, 0.5
+# What is seen lies behind where it is farther from the axis than the inside of an open end, one radius, and a fifth.
+BEHIND_RADII = 1.2
+# Free stretches shorter than this [m] are left out: two cells of a view's depths.
+SHORTEST = 0.03
+
+
+def free_stretches(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> list[tuple[float, float]]:
+    """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
+
+    Args:
+        cylinder: whose axis is looked at.
+        views: the keyframes, with the depths of the nearest surfaces (`with_depths`).
+        others: further cylinders, which may hide it.
+    """
+    count = max(int(np.ceil(cylinder.length / STEP)), 2)
+    along = (np.arange(count) + 0.5) * cylinder.length / count
+    points = cylinder.start + along[:, None] * cylinder.axis
+    rows = cylinder_rows(others)
+    behind, before = np.zeros(count), np.zeros(count)
+    for view in views:
+        through, opaque = _looked_through(points, cylinder.radius, view, rows)
+        behind += through
+        before += opaque
+    free = (behind >= MIN_VIEWS) & (behind > MIN_SHARE * (behind + before))
+    edges = np.flatnonzero(np.diff(np.r_[False, free, False].astype(np.int8)))
+    step = cylinder.length / count
+    stretches = [(float(first * step), float(last * step)) for first, last in edges.reshape(-1, 2)]
+    return [(first, last) for first, last in stretches if last - first > SHORTEST]
+
+
+def _looked_through(
+    points: FloatArray, radius: float, view: View, others: FloatArray
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Masks (N,) of the points (N, 3) behind which the view sees a surface, and before or at which it sees one.
+
+    A view tells where the cell of its depths would lie within the silhouette of a pipe of `radius` [m]: of thinner ones
+    stereo shows the wall behind them.
+    """
+    through, opaque = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    if view.nearest is None:
+        return through, opaque
+    cell = view.camera.width / view.nearest.shape[1]
+    looked = np.flatnonzero(in_image(view, points))
+    pixel, depth = project(view, points[looked])
+    told = (view.camera.fx * radius > cell * depth) & ~hidden_by_cylinders(view, pixel, depth, others)
+    looked, pixel, depth = looked[told], pixel[told], depth[told]
+    row = np.clip((pixel[:, 1] / cell).astype(np.int64), 0, view.nearest.shape[0] - 1)
+    column = np.clip((pixel[:, 0] / cell).astype(np.int64), 0, view.nearest.shape[1] - 1)
+    nearest = view.nearest[row, column]
+    behind = depth + max(BEFORE, BEHIND_RADII * radius)
+    through[looked] = np.isfinite(nearest) & (nearest > behind)
+    opaque[looked] = nearest <= behind
+    return through, opaque

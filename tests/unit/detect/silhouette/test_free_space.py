@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where views see through a cylinder: clouds of two pipes in line before a wall."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.silhouette.free_space import free_stretches
+from pipeprog_detect.silhouette.occlusion import with_depths
+from pipeprog_detect.types import Cylinder, View
+from tests.unit.detect.straight_ahead import looking_along_y
+
+HALF, WALL = 0.8, 0.25  # m: half of the line's length, and how far behind it the wall is
+# What a cell of the depths covers at the pipe (10 mm), on both sides of an edge, and a step of the search.
+RESOLVED = 0.035
+
+
+def tube(start: float, end: float, radius: float) -> FloatArray:
+    """Points on a pipe along x, open at its ends."""
+    x, angle = np.meshgrid(np.arange(start, end, 0.002), np.linspace(-np.pi, np.pi, 150))
+    return np.stack([x, radius * np.sin(angle), radius * np.cos(angle)], axis=-1).reshape(-1, 3)
+
+
+def seen(*surfaces: FloatArray) -> list[View]:
+    """Seven views of surfaces before a wall, with their depths."""
+    x, z = np.meshgrid(np.arange(-1.5, 1.5, 0.004), np.arange(-0.6, 0.6, 0.004))
+    wall = np.stack([x, np.full_like(x, WALL), z], axis=-1).reshape(-1, 3)
+    views = [looking_along_y(x, stamp) for stamp, x in enumerate(np.linspace(-0.4, 0.4, 7))]
+    return with_depths(views, np.concatenate([wall, *surfaces]))
+
+
+def line(radius: float) -> Cylinder:
+    return Cylinder(np.array([-HALF, 0.0, 0.0]), np.array([HALF, 0.0, 0.0]), radius)
+
+
+@given(middle=st.floats(-0.4, 0.4), gap=st.floats(0.12, 0.5), radius=st.floats(0.02, 0.1))
+@settings(max_examples=15, deadline=None)
+def test_a_gap_between_two_pipes_is_free(middle: float, gap: float, radius: float) -> None:
+    low, high = middle - 0.5 * gap, middle + 0.5 * gap
+    views = seen(tube(-HALF, low, radius), tube(high, HALF, radius))
+    stretches = free_stretches(line(radius), views, [])
+    assert len(stretches) == 1
+    assert stretches[0][0] - HALF == pytest.approx(low, abs=RESOLVED)
+    assert stretches[0][1] - HALF == pytest.approx(high, abs=RESOLVED)
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.06])
+def test_nothing_is_free_along_a_whole_pipe(radius: float) -> None:
+    assert free_stretches(line(radius), seen(tube(-HALF, HALF, radius)), []) == []
+
+
+def test_a_hidden_gap_is_not_told() -> None:
+    column = Cylinder(np.array([0.0, -0.3, -1.0]), np.array([0.0, -0.3, 1.0]), 0.45)
+    views = seen(tube(-HALF, -0.1, 0.03), tube(0.1, HALF, 0.03))
+    assert free_stretches(line(0.03), views, [])
+    assert free_stretches(line(0.03), views, [column]) == []
+
+
+def test_a_pipe_thinner_than_the_cells_is_not_judged() -> None:
+    assert free_stretches(line(0.008), seen(), []) == []
+
+
+def test_two_views_are_too_few() -> None:
+    views = seen(tube(-HALF, -0.1, 0.03), tube(0.1, HALF, 0.03))
+    assert free_stretches(line(0.03), views[:2], []) == []
