@@ -376,6 +376,10 @@ def sfm_status(message: SfmStatus) -> ReceivedStatus:
     stamp = checked_stamp(message.map_stamp)
     if len(message.scale_source) > MAX_NAME:
         raise InvalidMessageError("name", f"a scale_source of {len(message.scale_source)} characters is no source")
+    if message.map_revision > MAX_POSES:
+        raise InvalidMessageError(
+            "count", f"map_revision {message.map_revision}: a survey has a map for each keyframe, {MAX_POSES} at most"
+        )
     if message.map_revision and not 0.0 <= message.scale_sigma < np.inf:
         raise InvalidMessageError("scale", f"scale_sigma is {message.scale_sigma:g}: a map has one, zero or larger")
     return ReceivedStatus(stamp, message.map_revision, message.scale_source, message.scale_sigma)

@@ -180,12 +180,13 @@ def test_poses_that_no_survey_has_are_refused(message: Path, kind: str) -> None:
         ({"scale_sigma": np.inf}, "scale"),
         ({"scale_sigma": -0.1}, "scale"),
         ({"scale_source": "s" * 1000}, "name"),
+        ({"map_revision": 2**32 - 1}, "count"),
         ({"map_stamp": Time(sec=-5)}, "stamp"),
     ],
 )
-def test_a_status_without_a_usable_scale_is_refused(change: dict[str, object], kind: str) -> None:
+def test_a_status_that_no_survey_has_is_refused(change: dict[str, object], kind: str) -> None:
     with pytest.raises(InvalidMessageError) as refusal:
-        received.sfm_status(SfmStatus(**{"map_revision": 1, "scale_sigma": 0.1, **change}))
+        received.sfm_status(SfmStatus(**({"map_revision": 1, "scale_sigma": 0.1} | change)))
     assert refusal.value.kind == kind
 
 
