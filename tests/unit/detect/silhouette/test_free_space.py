@@ -15,8 +15,9 @@ from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.straight_ahead import looking_along_y
 
 HALF, WALL = 0.8, 0.25  # m: half of the line's length, and how far behind it the wall is
-# What a cell of the depths covers at the pipe (10 mm), on both sides of an edge, and a step of the search.
-RESOLVED = 0.035
+# What a cell of the depths covers at the pipe (10 mm), on both sides of an edge, and a step of the search [m]. Beside
+# that the pipe's own surface hides the axis beyond its end: by up to a radius, from aslant (45 deg at the most).
+RESOLVED, HIDDEN_RADII = 0.035, 1.0
 
 
 def tube(start: float, end: float, radius: float) -> FloatArray:
@@ -37,15 +38,15 @@ def line(radius: float) -> Cylinder:
     return Cylinder(np.array([-HALF, 0.0, 0.0]), np.array([HALF, 0.0, 0.0]), radius)
 
 
-@given(middle=st.floats(-0.4, 0.4), gap=st.floats(0.12, 0.5), radius=st.floats(0.02, 0.1))
+@given(middle=st.floats(-0.3, 0.3), gap=st.floats(0.3, 0.6), radius=st.floats(0.02, 0.1))
 @settings(max_examples=15, deadline=None)
 def test_a_gap_between_two_pipes_is_free(middle: float, gap: float, radius: float) -> None:
     low, high = middle - 0.5 * gap, middle + 0.5 * gap
     views = seen(tube(-HALF, low, radius), tube(high, HALF, radius))
     stretches = free_stretches(line(radius), views, [])
     assert len(stretches) == 1
-    assert stretches[0][0] - HALF == pytest.approx(low, abs=RESOLVED)
-    assert stretches[0][1] - HALF == pytest.approx(high, abs=RESOLVED)
+    assert -RESOLVED < stretches[0][0] - HALF - low < RESOLVED + HIDDEN_RADII * radius
+    assert -RESOLVED < high - (stretches[0][1] - HALF) < RESOLVED + HIDDEN_RADII * radius
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.06])
