@@ -34,7 +34,7 @@ from tests.fuzz.fuzzed_messages import fuzzed_messages
 COUNT = 150  # messages for each topic
 TIMEOUT = 120.0  # s
 STAMPS = [1_700_000_000_000_000_000 + number * 200_000_000 for number in range(3)]
-REVISION = 1_000_001
+REVISION = 100_000  # the largest that a status may have: later than every hostile one
 CAMERA = Camera(640, 360, 450.0, 450.0, 319.5, 179.5)
 BOQ = "classes:\n  - {name: DN100, outer_radius_mm: 57.5, planned_length_m: 4.0}\n"
 TOPICS = {
