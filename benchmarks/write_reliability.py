@@ -111,7 +111,8 @@ def reliability(results: Mapping[str, Mapping[str, Any]]) -> str:
 def _row(result: Mapping[str, Any]) -> tuple[str, ...]:
     bounds = result.get("limits", {})
     seconds, size = bounds.get("seconds"), bounds.get("bytes")
-    allowed = ", ".join([f"{seconds:g} s"] * (seconds is not None) + [f"{size / 2**30:g} GiB"] * (size is not None))
+    parts = [f"{seconds:g} s" if seconds else "", f"{size / 2**30:g} GiB" if size else ""]
+    allowed = ", ".join(part for part in parts if part)
     return (
         result["what"],
         cell(result["tried"]),
