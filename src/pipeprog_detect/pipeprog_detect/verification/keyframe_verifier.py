@@ -67,16 +67,17 @@ class KeyframeVerifier:
         that they turn out to be hide the others when these are measured.
         """
         order = sorted(range(len(candidates)), key=lambda number: -candidates[number].points)
-        current = {number: candidates[number].cylinder for number in order if trusted[number]}
+        current = {(number, 0): candidates[number].cylinder for number in order if trusted[number]}  # and piece
         found: list[MeasuredPipe] = []
         for number in order:
-            others = [cylinder for other, cylinder in current.items() if other != number]
+            others = [cylinder for (other, _), cylinder in current.items() if other != number]
             measured = self._measured(candidates[number], others, trusted[number])
             if measured is None or is_known(measured.cylinder, [known.cylinder for known in found]):
                 continue
             pieces = self._pieces(measured, others, trusted[number])
-            if pieces:
-                current[number] = pieces[0].cylinder
+            if not pieces:
+                current.pop((number, 0), None)
+            current |= {(number, index): piece.cylinder for index, piece in enumerate(pieces)}
             found += pieces
         return found
 
