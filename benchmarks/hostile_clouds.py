@@ -206,7 +206,7 @@ def in_points(offset: int, kind: str, value: int) -> Callable[[Path], None]:
 
 
 def with_longer_layer(more: int) -> Callable[[Path], None]:
-    """A LAZ whose chunk declares its first layer longer by so many bytes."""
+    """A LAZ whose chunk declares its first layer longer by `more` bytes than it is."""
 
     def write(path: Path) -> None:
         _las(path)

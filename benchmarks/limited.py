@@ -29,7 +29,7 @@ class Outcome:
 
 
 def run_limited(function: Callable[..., Any], arguments: tuple[Any, ...], seconds: float, memory: int) -> Outcome:
-    """Calls the function in a fork of this process, which may take so long and may address so much beyond its start."""
+    """Calls it in a fork of this process, which may take `seconds` and `memory` bytes beyond those at its start."""
     context = multiprocessing.get_context("fork")  # the parent has imported and compiled everything
     receiver, sender = context.Pipe(duplex=False)
     started = time.monotonic()
