@@ -22,11 +22,12 @@ MESSAGES = 40  # on each topic, of eight kinds
 def peer(tmp_path: Path) -> Iterator[Peer]:
     graph = LiveGraph(tmp_path)
     rclpy.init()
+    peer = Peer(graph)
     try:
-        peer = Peer(graph)
         peer.connect()
         yield peer
     finally:
+        peer.node.destroy_node()  # its messages are kept, and would reach the graphs of later tests
         rclpy.shutdown()
         graph.stop()
 
