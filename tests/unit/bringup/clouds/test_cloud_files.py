@@ -57,7 +57,7 @@ def test_a_valid_cloud_is_read(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(read_cloud(tmp_path / name).cloud.points, pipe(), atol=1e-4)
 
 
-@pytest.mark.parametrize("name", NAMED.keys() - READABLE.keys())
+@pytest.mark.parametrize("name", [name for name in NAMED if name not in READABLE])
 def test_a_hostile_cloud_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
     NAMED[name](tmp_path / name)
     started = time.process_time()
