@@ -43,8 +43,8 @@ from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.product.boq import load_boq
 from pipeprog_detect.types import Cloud, Pipe
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import decode_reduced
-from pipeprog_frames.selector import FrameSelector
+from pipeprog_frames.incoming.decoding import decode_reduced
+from pipeprog_frames.policy.selector import FrameSelector
 from pipeprog_sfm.boards.board_file import load_board_file
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.reconstruction import Reconstruction

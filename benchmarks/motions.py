@@ -24,11 +24,11 @@ from benchmarks.recordings import ROOT
 from benchmarks.survey import RESULTS
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import decode_reduced
-from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile
 from pipeprog_frames.frame_decision import Decision
+from pipeprog_frames.incoming.decoding import decode_reduced
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile
 from pipeprog_frames.overlap_feedback import OverlapReport
-from pipeprog_frames.stream import KeyframeStream
+from pipeprog_frames.policy.stream import KeyframeStream
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper
 

@@ -41,13 +41,13 @@ class Mutant:
 
 MUTANTS = {
     "frames: the last frame is dropped": Mutant(
-        "pipeprog_frames.selector.FrameSelector.flush",
+        "pipeprog_frames.policy.selector.FrameSelector.flush",
         "return decisions + self._leave_window()",
         "return decisions",
         "frames/test_selector.py",
     ),
     "frames: the first frame between two for the sharpest": Mutant(
-        "pipeprog_frames.frame_buffer.FrameStore.sharpest_between",
+        "pipeprog_frames.incoming.frame_buffer.FrameStore.sharpest_between",
         "max(sharp, key=lambda stamp: sharp[stamp], default=None)",
         "min(sharp, default=None)",
         "frames/test_frame_buffer.py",

@@ -29,8 +29,8 @@ from benchmarks.recordings import made, named
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import decode_reduced
-from pipeprog_frames.selector import FrameSelector
+from pipeprog_frames.incoming.decoding import decode_reduced
+from pipeprog_frames.policy.selector import FrameSelector
 
 RESULTS = Path(__file__).parent / "results" / "selector_cost.json"
 ROUNDS = 3  # the least of them counts: other work on the machine only adds

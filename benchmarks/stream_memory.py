@@ -23,10 +23,10 @@ from benchmarks.recordings import made, named
 from benchmarks.selector_cost import enlarged
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import decode_reduced
-from pipeprog_frames.frame_buffer import EncodedFrame, FrameRing
+from pipeprog_frames.incoming.decoding import decode_reduced
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameRing
 from pipeprog_frames.overlap_feedback import OverlapReport
-from pipeprog_frames.stream import KeyframeStream
+from pipeprog_frames.policy.stream import KeyframeStream
 
 RESULTS = Path(__file__).parent / "results"
 WIDTH = 3840

@@ -19,7 +19,7 @@ from mcap_ros2.reader import read_ros2_messages
 
 import pipeprog
 from pipeprog_detect.keyframe_cache import Keyframes
-from pipeprog_frames.decoding import decode_reduced
+from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_sfm.reconstruction import MetricMap
 
 

@@ -35,7 +35,7 @@ from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_boq
-from pipeprog_frames.decoding import decode_reduced
+from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_node import received
 from pipeprog_sfm.boards.board_file import load_board_file
 from tests.fuzz.attempts import Target

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pipeprog_detect.product.boq import BillOfQuantities, PipeClass, load_boq
     from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
     from pipeprog_frames.config import FramesConfig
-    from pipeprog_frames.selector import FrameSelector
+    from pipeprog_frames.policy.selector import FrameSelector
     from pipeprog_sfm.boards.board_file import load_board_file
     from pipeprog_sfm.config import SfmConfig
     from pipeprog_sfm.reconstruction import Reconstruction
@@ -64,7 +64,7 @@ _MODULES = {
     "pipeprog_detect.product.boq": ("BillOfQuantities", "PipeClass", "load_boq"),
     "pipeprog_detect.types": ("Cloud", "Cylinder", "Pipe", "View"),
     "pipeprog_frames.config": ("FramesConfig",),
-    "pipeprog_frames.selector": ("FrameSelector",),
+    "pipeprog_frames.policy.selector": ("FrameSelector",),
     "pipeprog_sfm.boards.board_file": ("load_board_file",),
     "pipeprog_sfm.config": ("SfmConfig",),
     "pipeprog_sfm.reconstruction": ("Reconstruction",),

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_frames.decoding import GrayImage
+from pipeprog_frames.incoming.decoding import GrayImage
 
 PointArray = NDArray[np.float32]
 FloatRows = NDArray[np.float32]

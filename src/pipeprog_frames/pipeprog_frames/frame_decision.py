@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from pipeprog_frames.decoding import GrayImage
+from pipeprog_frames.incoming.decoding import GrayImage
 from pipeprog_frames.tracker import Track
 
 NAN = float("nan")

@@ -16,11 +16,11 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_NAME
 from pipeprog_frames.acknowledgements import MAX_AHEAD, Answer, Ledger
-from pipeprog_frames.arrival import MAX_QUEUE, Arrival, ArrivalQueue
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import decode_reduced, reduce_image
-from pipeprog_frames.frame_buffer import EncodedFrame
 from pipeprog_frames.frame_decision import DAMAGED, FAULTS, UNCALIBRATED, Decision
+from pipeprog_frames.incoming.arrival import MAX_QUEUE, Arrival, ArrivalQueue
+from pipeprog_frames.incoming.decoding import decode_reduced, reduce_image
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame
 from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.selection import Selected, Selection
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired

@@ -6,16 +6,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from pipeprog_camera.camera import Camera
-from pipeprog_frames.arrival import Arrival
-from pipeprog_frames.calibrations import Calibrations
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import GrayImage, is_cut_off, reduced_size
-from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
 from pipeprog_frames.frame_decision import DAMAGED, OTHER_SIZE, UNCALIBRATED, Decision
+from pipeprog_frames.incoming.arrival import Arrival
+from pipeprog_frames.incoming.calibrations import Calibrations
+from pipeprog_frames.incoming.decoding import GrayImage, is_cut_off, reduced_size
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
+from pipeprog_frames.incoming.stamp_order import StampOrder
 from pipeprog_frames.overlap_feedback import OverlapReport
-from pipeprog_frames.selection_policy import Policy, make_policy
-from pipeprog_frames.stamp_order import StampOrder
-from pipeprog_frames.stream import KeyframeStream
+from pipeprog_frames.policy.selection_policy import Policy, make_policy
+from pipeprog_frames.policy.stream import KeyframeStream
 
 Selected = list[tuple[Decision, EncodedFrame | None]]  # decisions, those for a keyframe with the frame
 

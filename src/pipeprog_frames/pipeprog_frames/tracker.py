@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.corners import PointArray, corners
-from pipeprog_frames.decoding import GrayImage
+from pipeprog_frames.incoming.decoding import GrayImage
 
 MIN_CORNERS = 30  # in a keyframe: enough for a median after losing two thirds
 MIN_TRACKED = 10  # corners: three determine an affine map, the others confirm it

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
-from pipeprog_frames.arrival import Arrival
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import decode_reduced
+from pipeprog_frames.incoming.arrival import Arrival
+from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.selection import Selected, Selection
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeprog_frames.frame_decision import Decision
-from pipeprog_frames.image_network import START_PERIOD, ImageNetwork
 from pipeprog_frames.overlap_feedback import OverlapReport, StreamFeedback
+from pipeprog_frames.policy.image_network import START_PERIOD, ImageNetwork
 
 FEATURES = 2000
 FPS = 30

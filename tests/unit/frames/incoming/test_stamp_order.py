@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeprog_frames.stamp_order import AGREEING, MAX_GAP, StampOrder
+from pipeprog_frames.incoming.stamp_order import AGREEING, MAX_GAP, StampOrder
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND

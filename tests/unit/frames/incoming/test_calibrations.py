@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pipeprog_camera.camera import Camera
-from pipeprog_frames.calibrations import MAX_SIZES, MAX_STAMPS, Calibrations
+from pipeprog_frames.incoming.calibrations import MAX_SIZES, MAX_STAMPS, Calibrations
 
 WIDE = Camera(640, 480, 300.0, 300.0, 319.5, 239.5)
 ZOOMED = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)

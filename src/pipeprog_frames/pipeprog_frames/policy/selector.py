@@ -8,10 +8,10 @@ from collections import deque
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.corners import corners, sharpness
-from pipeprog_frames.decode_schedule import MAX_UNSEEN, DecodeSchedule
-from pipeprog_frames.decoding import GrayImage
 from pipeprog_frames.frame_decision import DAMAGED, JUMP, UNMATCHED, Candidate, Decision, Load
-from pipeprog_frames.keyframe_limits import KeyframeLimits
+from pipeprog_frames.incoming.decoding import GrayImage
+from pipeprog_frames.policy.decode_schedule import MAX_UNSEEN, DecodeSchedule
+from pipeprog_frames.policy.keyframe_limits import KeyframeLimits
 from pipeprog_frames.tracker import MIN_CORNERS, Tracker
 
 BLUR_TOLERANCE = 0.8  # of the sharpest frame's Laplacian; sharp neighbours differ by up to a fifth by content alone

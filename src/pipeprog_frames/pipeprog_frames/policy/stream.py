@@ -10,7 +10,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import Decision, Load
 from pipeprog_frames.overlap_feedback import BestBetween, OverlapReport, StreamFeedback
-from pipeprog_frames.selector import FrameSelector
+from pipeprog_frames.policy.selector import FrameSelector
 
 UNLOADED_LAG = 5  # keyframes that the SfM may be behind without load: a bundle adjustment takes seconds at times
 FULL_LAG = 25  # keyframes behind at which the load counts as full: half of what the SfM's queue holds (50)

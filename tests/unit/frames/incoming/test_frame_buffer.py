@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.camera import Camera
-from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 CAPACITY = 1 << 20  # bytes

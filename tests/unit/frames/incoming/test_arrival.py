@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from pipeprog_frames.arrival import MAX_QUEUE, MAX_QUEUE_BYTES, Arrival, ArrivalQueue
+from pipeprog_frames.incoming.arrival import MAX_QUEUE, MAX_QUEUE_BYTES, Arrival, ArrivalQueue
 
 
 def test_the_oldest_of_many_small_images_gives_way() -> None:

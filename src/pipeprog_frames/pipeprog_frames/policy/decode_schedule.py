@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from pipeprog_frames.keyframe_limits import KeyframeLimits
+from pipeprog_frames.policy.keyframe_limits import KeyframeLimits
 from pipeprog_frames.tracker import Track
 
 MAX_UNSEEN = 200_000_000  # ns between two looks: a turn of 90 degrees a second moves by 18, within the tracker's reach

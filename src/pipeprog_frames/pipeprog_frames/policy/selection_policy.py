@@ -9,9 +9,9 @@ from typing import Protocol
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import Decision, Load
-from pipeprog_frames.image_network import ImageNetwork
 from pipeprog_frames.overlap_feedback import BestBetween, OverlapReport
-from pipeprog_frames.stream import KeyframeStream
+from pipeprog_frames.policy.image_network import ImageNetwork
+from pipeprog_frames.policy.stream import KeyframeStream
 
 
 class Policy(Protocol):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_frames.corners import corners, sharpness
-from pipeprog_frames.decoding import GrayImage, decode_reduced
+from pipeprog_frames.incoming.decoding import GrayImage, decode_reduced
 from pipeprog_frames.tracker import MIN_CORNERS
 
 CHOICE = 3  # frames nearest to the middle, of which the sharpest is taken: a footstep blurs one, not all three

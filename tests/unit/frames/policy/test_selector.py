@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.decoding import decode_reduced, is_cut_off, reduction
-from pipeprog_frames.frame_buffer import EncodedFrame, FrameFile, FrameRing
 from pipeprog_frames.frame_decision import Decision, Load
-from pipeprog_frames.selector import FrameSelector
-from pipeprog_frames.stream import KeyframeStream
+from pipeprog_frames.incoming.decoding import decode_reduced, is_cut_off, reduction
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile, FrameRing
+from pipeprog_frames.policy.selector import FrameSelector
+from pipeprog_frames.policy.stream import KeyframeStream
 from pipeprog_frames.tracker import Tracker
 
 WIDTH, HEIGHT = 320, 180
