@@ -10,9 +10,7 @@ without the file's name. Writes results/hostile_clouds.json.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import os
 import random
 import re
@@ -31,8 +29,7 @@ import pye57
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 
-from benchmarks.limited import Outcome, run_limited
-from benchmarks.survey import RESULTS, commit
+from benchmarks.limited import Outcome, count_and_seed, try_files, write_tried
 from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -581,37 +578,14 @@ def judged(path: Path, outcome: Outcome) -> str:
 
 def main() -> None:
     """Tries the clouds and writes what failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tried", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    failures, outcomes = [], []
+    arguments = count_and_seed(__doc__)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _ply(folder / "warm.ply")
         read_and_detect(folder / "warm.ply")  # compiles what the processes share
-        for path in itertools.chain(
-            _named(folder), mutated(folder, max(0, arguments.tried - len(NAMED)), arguments.seed)
-        ):
-            outcome = run_limited(read_and_detect, (path,), SECONDS, MEMORY)
-            outcomes.append(outcome)
-            if reason := judged(path, outcome):
-                failures.append({"name": path.name, "reason": reason})
-                print(f"{path.name}: {reason}", flush=True)
-    document = {
-        "what": WHAT,
-        "commit": commit(),
-        "command": f"python -m benchmarks.hostile_clouds --tried {arguments.tried} --seed {arguments.seed}",
-        "tried": len(outcomes),
-        "failed": len(failures),
-        "refused": sum(outcome.kind == "refused" for outcome in outcomes),
-        "failures": failures,
-        "limits": {"seconds": SECONDS, "bytes": MEMORY},
-        "worst_seconds": round(max(outcome.seconds for outcome in outcomes), 1),
-        "worst_bytes": max(outcome.memory for outcome in outcomes),
-    }
-    (RESULTS / "hostile_clouds.json").write_text(json.dumps(document, indent=1) + "\n")
-    print(json.dumps({key: value for key, value in document.items() if key != "failures"}, indent=1))
+        more = mutated(folder, max(0, arguments.tried - len(NAMED)), arguments.seed)
+        tried = try_files(itertools.chain(_named(folder), more), read_and_detect, judged, SECONDS, MEMORY)
+    write_tried("hostile_clouds", WHAT, arguments, tried)
 
 
 def _named(folder: Path) -> Iterator[Path]:

@@ -11,11 +11,9 @@ without the file's name. Writes results/hostile_yaml.json.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import itertools
-import json
 import os
 import random
 import re
@@ -25,9 +23,8 @@ from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads do not survive a fork
 
-from benchmarks.limited import Outcome, run_limited
+from benchmarks.limited import Outcome, count_and_seed, try_files, write_tried
 from benchmarks.recordings import ROOT
-from benchmarks.survey import RESULTS, commit
 from pipeprog_bringup.console import print_progress, print_score
 from pipeprog_bringup.ingest import read_camera
 from pipeprog_bringup.recording.bag_folder import parts
@@ -353,35 +350,14 @@ def judged(path: Path, outcome: Outcome) -> str:
 
 def main() -> None:
     """Tries the files and writes what failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tried", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    failures, outcomes = [], []
+    arguments = count_and_seed(__doc__)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for kind in VALID:  # imports what the processes share
             read_and_use(_beside(folder / "x", f"good.{kind}"))
-        for path in _tried(folder, arguments.tried, arguments.seed):
-            outcome = run_limited(read_and_use, (path,), SECONDS, MEMORY)
-            outcomes.append(outcome)
-            if reason := judged(path, outcome):
-                failures.append({"name": path.name, "reason": reason})
-                print(f"{path.name}: {reason}", flush=True)
-    document = {
-        "what": WHAT,
-        "commit": commit(),
-        "command": f"python -m benchmarks.hostile_yaml --tried {arguments.tried} --seed {arguments.seed}",
-        "tried": len(outcomes),
-        "failed": len(failures),
-        "refused": sum(outcome.kind == "refused" for outcome in outcomes),
-        "failures": failures,
-        "limits": {"seconds": SECONDS, "bytes": MEMORY},
-        "worst_seconds": round(max(outcome.seconds for outcome in outcomes), 1),
-        "worst_bytes": max(outcome.memory for outcome in outcomes),
-    }
-    (RESULTS / "hostile_yaml.json").write_text(json.dumps(document, indent=1) + "\n")
-    print(json.dumps({key: value for key, value in document.items() if key != "failures"}, indent=1))
+        files = _tried(folder, arguments.tried, arguments.seed)
+        tried = try_files(files, read_and_use, judged, SECONDS, MEMORY)
+    write_tried("hostile_yaml", WHAT, arguments, tried)
 
 
 def _tried(folder: Path, count: int, seed: int) -> Iterator[Path]:

@@ -2,7 +2,9 @@
 """Keeps every test run to itself: on the loopback interface, at ports that no replay and no other run uses."""
 
 import contextlib
+import resource
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,3 +23,13 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     """Gives the ports back."""
     _KEPT.close()
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """Two gigabytes more than are in use: an allocation of what a header declares fails."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 31), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import resource
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,15 +12,7 @@ from benchmarks.hostile_yaml import NAMED, VALID, judged, read_and_use
 from benchmarks.limited import Outcome
 from pipeprog_camera.errors import InputError
 
-
-@pytest.fixture(autouse=True)
-def little_memory() -> Iterator[None]:
-    """Two gigabytes more than are in use."""
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 31), before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, before)
+pytestmark = pytest.mark.usefixtures("little_memory")
 
 
 @pytest.mark.parametrize("kind", VALID)

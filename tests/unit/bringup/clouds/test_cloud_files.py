@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import laspy
@@ -20,6 +18,8 @@ from pipeprog_bringup.clouds import columns, laz, laz_decoder
 from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_COORDINATE
+
+pytestmark = pytest.mark.usefixtures("little_memory")
 
 # What can be read in spite of its oddity, and the number of points that are used and dropped.
 READABLE = {
@@ -39,16 +39,6 @@ READABLE = {
     "numbers of 5000 digits.xyz": (1, 1),
     "1e400.xyz": (1, 1),
 }
-
-
-@pytest.fixture(autouse=True)
-def little_memory() -> Iterator[None]:
-    """Two gigabytes more than are in use: an allocation of what a header declares fails."""
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 31), before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 @pytest.mark.parametrize("name", VALID)
