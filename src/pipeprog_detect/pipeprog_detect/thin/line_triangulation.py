@@ -6,31 +6,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import in_image, project
-from pipeprog_detect.thin.depth_from_cloud import (
-    BESIDE_REACH,
-    DEPTH_REACH,
-    at_cloud_depth,
-    by_bin,
-    covers,
-    extended_to,
-    robust_line,
-)
-from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
-from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, extended_to
+from pipeprog_detect.thin.pair_views import CENTRE_SIGMA, WIDTH_SIGMA, PairView, centre_lines, rays
+from pipeprog_detect.types import Cylinder
 
-# Baseline from view to view, as a share of the median depth of what they see, and number of views at the most.
-STEP, MOST_VIEWS = 0.12, 120
-# Half of a thin pipe's width [px] that suffices to see its two sides: larger images are reduced.
-ENOUGH = 4.5
-# Standard deviations of a segment pair's centre line and width [px], shading and shadows beside the pipe included.
-CENTRE_SIGMA, WIDTH_SIGMA = 1.0, 1.2
-# Largest accepted sum of their squares: chi square of two degrees of freedom, exceeded once in a thousand times.
+# Largest accepted sum of the squares of a segment pair's distance and width, over their standard deviations: chi
+# square of two degrees of freedom, exceeded once in a thousand times.
 WORST = 13.8
 # Following views in which a segment pair is triangulated, least number of views that must show a pipe, and least share
 # of those in which its middle lies.
@@ -43,19 +29,6 @@ DEPTH_SIGMA = 1.0
 SAME_LINE = 0.5
 # Hypotheses that are followed into all views (a computing budget), and rounds of least squares on what matches.
 MOST_HYPOTHESES, ROUNDS = 4000, 2
-
-
-@dataclass(frozen=True)
-class _PairView:
-    """One view at the size at which lines were sought, its segment pairs, and the depths [m] of what it sees.
-
-    `before` (N, 2): depth [m] of the cloud at the segment pairs' ends, NaN where the cloud does not show them.
-    """
-
-    view: View
-    pairs: SegmentPairs
-    depth: tuple[float, float]
-    before: FloatArray
 
 
 @dataclass(frozen=True)
@@ -75,12 +48,7 @@ _NO_AXES = _Axes(np.zeros((0, 2, 3)), np.zeros(0), np.zeros(0))
 
 
 def propose(
-    views: Sequence[View],
-    points: NDArray[np.float32],
-    radii: Sequence[float],
-    known: Sequence[Cylinder],
-    limit: int,
-    edges: dict[tuple[int, int], FloatArray] | None = None,
+    pair_views: Sequence[PairView], points: NDArray[np.float32], radii: Sequence[float], limit: int
 ) -> list[Cylinder]:
     """Up to `limit` cylinders of the given radii [m] that the lines of several views agree on, best seen first.
 
@@ -89,16 +57,11 @@ def propose(
     highlight beside it makes a rival of the pipe: both are proposed.
 
     Args:
-        views: the keyframes.
-        points: of the cloud (N, 3); they bound the depths of each view.
+        pair_views: the keyframes with their segment pairs.
+        points: of the cloud (N, 3); they tell the depth.
         radii: of thin pipes [m].
-        known: cylinders in whose silhouettes no segment pairs are sought.
         limit: largest number of cylinders.
-        edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
-    edges = {} if edges is None else edges
-    seen = (_pair_view(view, points, radii, known, edges) for view in _apart(views, points))
-    pair_views = [each for each in seen if each is not None]
     axes = _hypotheses(pair_views, radii)
     for _ in range(ROUNDS):
         axes = _adjusted(axes, pair_views)
@@ -113,7 +76,7 @@ def propose(
     return [Cylinder(ends[0], ends[1], float(radius)) for ends, radius in zip(axes.ends, axes.radius, strict=True)]
 
 
-def _hypotheses(pair_views: Sequence[_PairView], radii: Sequence[float]) -> _Axes:
+def _hypotheses(pair_views: Sequence[PairView], radii: Sequence[float]) -> _Axes:
     """Axes from the cloud's depth at single segment pairs, and from pairs of pairs; evenly thinned."""
     parts = [_NO_AXES]
     parts += [_at_cloud_depth(pair_view, radius) for pair_view in pair_views for radius in radii]
@@ -128,7 +91,7 @@ def _hypotheses(pair_views: Sequence[_PairView], radii: Sequence[float]) -> _Axe
     return axes.select(np.arange(0, len(axes.radius), max(-(-len(axes.radius) // MOST_HYPOTHESES), 1)))
 
 
-def _best_seen(axes: _Axes, pair_views: Sequence[_PairView], limit: int) -> tuple[list[Cylinder], list[FloatArray]]:
+def _best_seen(axes: _Axes, pair_views: Sequence[PairView], limit: int) -> tuple[list[Cylinder], list[FloatArray]]:
     """Up to `limit` cylinders that most views show, the same line once, and the mean centres (3,) of these views."""
     found: list[Cylinder] = []
     centres: list[FloatArray] = []
@@ -150,158 +113,23 @@ def _best_seen(axes: _Axes, pair_views: Sequence[_PairView], limit: int) -> tupl
     return found, centres
 
 
-def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
-    """Views of the cloud's points far enough from the last one to tell more than it did."""
-    chosen: list[View] = []
-    sparse = points[:: max(len(points) // 5000, 1)]
-    for view in views:
-        depth = _points_in(view, sparse)[1]
-        if len(depth) and (
-            not chosen or np.linalg.norm(view.centre - chosen[-1].centre) > STEP * float(np.median(depth))
-        ):
-            chosen.append(view)
-    return chosen[:: -(-len(chosen) // MOST_VIEWS)] if chosen else []
-
-
-def _pair_view(
-    view: View,
-    points: NDArray[np.float32],
-    radii: Sequence[float],
-    known: Sequence[Cylinder],
-    lines: dict[tuple[int, int], FloatArray],
-) -> _PairView | None:
-    pixel, depth = _points_in(view, points)
-    if len(depth) < 100:
-        return None
-    near, middle, far = np.percentile(depth[:: max(len(depth) // 5000, 1)], [1, 50, 99])
-    scale = min(1.0, ENOUGH * middle / (min(radii) * view.camera.fx))
-    scale = 2.0 ** (round(4.0 * np.log2(scale)) / 4.0)  # few sizes, so that edges found before serve again
-    if scale < 1.0:
-        width, height = (max(round(scale * side), 1) for side in (view.camera.width, view.camera.height))
-        image = np.asarray(cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        view = replace(view, image=image, camera=view.camera.scaled(scale))
-        pixel = (pixel + 0.5) * scale - 0.5
-    focal = view.camera.fx
-    narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
-    key = (view.stamp, view.camera.width)
-    if key not in lines:
-        lines[key] = straight_edges(view.image)
-    found = segment_pairs(lines[key], max(narrowest, 2.0), widest)
-    within = np.zeros(len(found), bool)
-    for cylinder in known:
-        within |= _within_silhouette(found, cylinder, view)
-    found = found.select(~within)
-    before, flat = _cloud_depths(found, pixel, depth, min(radii))
-    return _PairView(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
-
-
-def _cloud_depths(
-    found: SegmentPairs, pixel: NDArray[np.float32], depth: NDArray[np.float32], radius: float
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Depth [m] of the cloud at the ends (N, 2) of segment pairs that stand out from it, and which lie flat in it (N,).
-
-    A pipe that touches a wall stands out from it by its diameter, a painted strip, a joint or a shadow does not.
-    Stereo spreads a thin pipe in depth, towards the wall: of the points within a segment pair the nearer count. Where a
-    segment pair holds too few, depth is NaN.
-    """
-    before = np.full((len(found), 2), np.nan)
-    flat = np.zeros(len(found), bool)
-    for number in range(len(found)):
-        ends, width = found.ends[number], float(found.width[number].mean())
-        reach = BESIDE_REACH * width
-        near = ((pixel > ends.min(axis=0) - reach) & (pixel < ends.max(axis=0) + reach)).all(axis=1)
-        along = ends[1] - ends[0]
-        length = float(np.linalg.norm(along))
-        along = along / length
-        offset = pixel[near] - ends[0]
-        place, aside = offset @ along, offset @ np.array([-along[1], along[0]])
-        within = (place > 0) & (place < length)
-        bins = max(int(length / max(width, 6.0)), 3)
-        cell = np.clip((place / length * bins).astype(int), 0, bins - 1)
-        inner = within & (np.abs(aside) < 0.35 * width)
-        front = by_bin(cell[inner], depth[near][inner], bins, 30.0)
-        flanks = []
-        for side in (-1.0, 1.0):
-            beside = within & (side * aside > 1.2 * width) & (side * aside < reach)
-            flanks.append(by_bin(cell[beside], depth[near][beside], bins, 50.0))
-        known = np.isfinite(front)
-        if known.sum() < 0.5 * bins:
-            continue
-        behind = np.fmax(*flanks)
-        step = behind - front
-        judged = np.isfinite(step)
-        flat[number] = judged.sum() >= 0.5 * bins and np.median(step[judged]) < radius
-        if flat[number]:
-            continue
-        # Inverse depth is linear along the image of a line.
-        at = (np.arange(bins) + 0.5) / bins
-        slope, level = robust_line(at[known], 1.0 / front[known])
-        if level > 0 and level + slope > 0:
-            before[number] = 1.0 / level, 1.0 / (level + slope)
-    return before, flat
-
-
-def _at_cloud_depth(pair_view: _PairView, radius: float) -> _Axes:
+def _at_cloud_depth(pair_view: PairView, radius: float) -> _Axes:
     """Axes of segment pairs that stand out from the cloud and are as wide as a pipe of `radius` [m] would be there."""
     depth = pair_view.before + 0.5 * radius
     width = 2.0 * pair_view.view.camera.fx * radius / depth
     fits = np.isfinite(depth).all(axis=1) & (np.abs(width - pair_view.pairs.width).max(axis=1) < 2.5 * WIDTH_SIGMA)
-    in_camera = _rays(pair_view)[fits] * depth[fits][..., None]
+    in_camera = rays(pair_view)[fits] * depth[fits][..., None]
     pose = np.linalg.inv(pair_view.view.camera_from_map)
     count = len(in_camera)
     return _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(count, radius), np.full(count, DEPTH_SIGMA * radius))
 
 
-def _points_in(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Pixels (M, 2) and depths (M,) [m] of those points (N, 3) that lie within the view."""
-    pose = view.camera_from_map.astype(np.float32)
-    camera = view.camera
-    depth = points @ pose[2, :3] + pose[2, 3]
-    front = depth > 0.05
-    points, depth = points[front], depth[front]
-    x = camera.fx * (points @ pose[0, :3] + pose[0, 3]) / depth + camera.cx
-    y = camera.fy * (points @ pose[1, :3] + pose[1, 3]) / depth + camera.cy
-    inside = (x > 0) & (y > 0) & (x < camera.width - 1) & (y < camera.height - 1)
-    return np.stack([x[inside], y[inside]], axis=1), depth[inside]
-
-
-def _within_silhouette(found: SegmentPairs, cylinder: Cylinder, view: View) -> NDArray[np.bool_]:
-    """Segment pairs (N,) whose both ends lie within the silhouette of a cylinder."""
-    ends, depth = project(view, np.stack([cylinder.start, cylinder.end]))
-    if (depth < 0.05).any():
-        return np.zeros(len(found), bool)
-    along = ends[1] - ends[0]
-    length = float(np.linalg.norm(along)) + 1e-9
-    along = along / length
-    offset = found.ends - ends[0]
-    place = offset @ along
-    aside = np.abs(offset @ np.array([-along[1], along[0]]))
-    reach = view.camera.fx * cylinder.radius / depth.min()
-    return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
-
-
-def _rays(pair_view: _PairView) -> FloatArray:
-    """Directions (N, 2, 3) with unit depth, in the camera's frame, of the segment pairs' ends."""
-    camera = pair_view.view.camera
-    ends = pair_view.pairs.ends
-    x = (ends[..., 0] - camera.cx) / camera.fx
-    y = (ends[..., 1] - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
-
-
-def _centre_lines(found: SegmentPairs) -> FloatArray:
-    """Lines (N, 3) through the segment pairs' ends with unit normals: line . (x, y, 1) is the distance [px]."""
-    along = found.ends[:, 1] - found.ends[:, 0]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
-    return np.concatenate([normal, -np.einsum("ij,ij->i", normal, found.ends[:, 0])[:, None]], axis=1)
-
-
-def _without_depth(pair_view: _PairView) -> _PairView:
+def _without_depth(pair_view: PairView) -> PairView:
     """The view with those segment pairs alone that the cloud does not show."""
     return replace(pair_view, pairs=pair_view.pairs.select(np.asarray(np.isnan(pair_view.before).any(axis=1), bool)))
 
 
-def _triangulated(pair_view: _PairView, other: _PairView, radius: float) -> _Axes:
+def _triangulated(pair_view: PairView, other: PairView, radius: float) -> _Axes:
     """Axes that a segment pair of one view and one of another make with a radius [m].
 
     The inverse depth of each end of the first follows by linear least squares from both widths and from the distance
@@ -312,10 +140,10 @@ def _triangulated(pair_view: _PairView, other: _PairView, radius: float) -> _Axe
     pair_view, other = _without_depth(pair_view), _without_depth(other)  # what the cloud shows needs no second view
     if not len(pair_view.pairs) or not len(other.pairs):
         return _NO_AXES
-    focal, rays = pair_view.view.camera.fx, _rays(pair_view)
+    focal, sights = pair_view.view.camera.fx, rays(pair_view)
     other_from_first = other.view.camera_from_map @ np.linalg.inv(pair_view.view.camera_from_map)
     matrix = other.view.camera.matrix
-    still = rays @ (matrix @ other_from_first[:3, :3]).T
+    still = sights @ (matrix @ other_from_first[:3, :3]).T
     shift = matrix @ other_from_first[:3, 3]
     width = pair_view.pairs.width
     first = width / (2.0 * focal * radius)
@@ -323,7 +151,7 @@ def _triangulated(pair_view: _PairView, other: _PairView, radius: float) -> _Axe
     if not (depth > 0.1).any():
         return _NO_AXES
     depth = np.maximum(depth, 0.1)
-    line = _centre_lines(other.pairs)
+    line = centre_lines(other.pairs)
     slope = (line @ shift)[None, None] / (depth[..., None] * CENTRE_SIGMA)
     level = -np.einsum("pek,qk->peq", still, line) / (depth[..., None] * CENTRE_SIGMA)
     gauge = 2.0 * focal * radius / WIDTH_SIGMA
@@ -339,14 +167,14 @@ def _triangulated(pair_view: _PairView, other: _PairView, radius: float) -> _Axe
     one, two = np.nonzero(good)
     if not len(one):
         return _NO_AXES
-    in_camera = rays[one] / inverse[one, :, two][..., None]
+    in_camera = sights[one] / inverse[one, :, two][..., None]
     pose = np.linalg.inv(pair_view.view.camera_from_map)
     axes = _Axes(in_camera @ pose[:3, :3].T + pose[:3, 3], np.full(len(one), radius), np.full(len(one), DEPTH_REACH))
     ends, _ = _projected(axes, other)
     return axes.select(_overlap(ends, other.pairs.ends[two]) > OVERLAP)
 
 
-def _projected(axes: _Axes, pair_view: _PairView) -> tuple[FloatArray, FloatArray]:
+def _projected(axes: _Axes, pair_view: PairView) -> tuple[FloatArray, FloatArray]:
     """Pixels (H, 2, 2) and depths (H, 2) of the axes' ends."""
     pixel, depth = project(pair_view.view, axes.ends.reshape(-1, 3))
     return pixel.reshape(-1, 2, 2), depth.reshape(-1, 2)
@@ -363,12 +191,12 @@ def _overlap(ends: FloatArray, others: FloatArray) -> FloatArray:
     return np.asarray((high - low) / (shorter + 1e-9))
 
 
-def _in_view(axes: _Axes, pair_view: _PairView) -> NDArray[np.bool_]:
+def _in_view(axes: _Axes, pair_view: PairView) -> NDArray[np.bool_]:
     """Which axes (H,) have their middle inside the view."""
     return in_image(pair_view.view, axes.ends.mean(axis=1))
 
 
-def _matches(axes: _Axes, pair_view: _PairView) -> NDArray[np.int64]:
+def _matches(axes: _Axes, pair_view: PairView) -> NDArray[np.int64]:
     """Index (H,) of the segment pair of the view that fits each axis best, -1 where none does."""
     none = np.full(len(axes.radius), -1)
     if not len(pair_view.pairs):
@@ -391,7 +219,7 @@ def _matches(axes: _Axes, pair_view: _PairView) -> NDArray[np.int64]:
     return np.where(worst[np.arange(len(best)), best] < WORST, best, none)
 
 
-def _adjusted(axes: _Axes, pair_views: Sequence[_PairView]) -> _Axes:
+def _adjusted(axes: _Axes, pair_views: Sequence[PairView]) -> _Axes:
     """The axes after a least-squares step on the segment pairs that match, and as long as what these show.
 
     Each end moves across the axis by (2,); the pairs' centre lines and widths, at both of their ends, are the
@@ -421,7 +249,7 @@ def _adjusted(axes: _Axes, pair_views: Sequence[_PairView]) -> _Axes:
     return replace(axes, ends=ends)
 
 
-def _basis(axes: _Axes, pair_views: Sequence[_PairView]) -> FloatArray:
+def _basis(axes: _Axes, pair_views: Sequence[PairView]) -> FloatArray:
     """Two unit vectors (H, 2, 3) across each axis: sideways as the views that show it see it, and away from them."""
     along = axes.ends[:, 1] - axes.ends[:, 0]
     along = along / np.linalg.norm(along, axis=1)[:, None]
@@ -434,7 +262,7 @@ def _basis(axes: _Axes, pair_views: Sequence[_PairView]) -> FloatArray:
 
 
 def _observe(
-    axes: _Axes, basis: FloatArray, seen: _PairView, equations: _NormalEquations, rows: NDArray[np.int64]
+    axes: _Axes, basis: FloatArray, seen: PairView, equations: _NormalEquations, rows: NDArray[np.int64]
 ) -> list[FloatArray]:
     """Adds what a view's pairs, one for each of the axes, tell of these to the equations `rows`.
 
@@ -442,7 +270,7 @@ def _observe(
     """
     length = np.linalg.norm(axes.ends[:, 1] - axes.ends[:, 0], axis=1)
     along = (axes.ends[:, 1] - axes.ends[:, 0]) / length[:, None]
-    line, camera, rotation = _centre_lines(seen.pairs), seen.view.camera, seen.view.camera_from_map[:3, :3]
+    line, camera, rotation = centre_lines(seen.pairs), seen.view.camera, seen.view.camera_from_map[:3, :3]
     pixel, far = _projected(axes, seen)
     image_along = pixel[:, 1] - pixel[:, 0]
     square = (image_along**2).sum(axis=1)

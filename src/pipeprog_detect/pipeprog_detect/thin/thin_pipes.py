@@ -18,6 +18,7 @@ from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.depth_from_cloud import at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
+from pipeprog_detect.thin.pair_views import pair_views
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 
@@ -66,7 +67,8 @@ def find_thin_pipes(
     some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
     thin: list[MeasuredPipe] = []
-    for proposed in propose(views, some, radii, known, MOST_PROPOSED, edges):
+    seen = pair_views(views, some, radii, known, edges)
+    for proposed in propose(seen, some, radii, MOST_PROPOSED):
         if is_known(proposed, known) or _is_rival(proposed, thin, views):
             continue
         fit = lines.measure(proposed, known, follow=False)

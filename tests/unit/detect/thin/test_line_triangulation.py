@@ -9,6 +9,7 @@ import pytest
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.thin.line_segments import segment_pairs, straight_edges
 from pipeprog_detect.thin.line_triangulation import propose
+from pipeprog_detect.thin.pair_views import pair_views
 from pipeprog_detect.thin.thin_pipes import FLAT, SURELY
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, WALL, front_points, wall_points
@@ -20,6 +21,10 @@ RADII = [PIPE.radius]
 
 def cloud(*pipes: Cylinder) -> np.ndarray:
     return np.concatenate([wall_points(), *(front_points(pipe) for pipe in pipes)]).astype(np.float32)
+
+
+def proposed(views: list[View], points: np.ndarray, radii: list[float], known: list[Cylinder]) -> list[Cylinder]:
+    return propose(pair_views(views, points, radii, known, {}), points, radii, 5)
 
 
 def test_edges_of_a_band_make_one_segment_pair() -> None:
@@ -44,7 +49,7 @@ def test_segments_of_one_edge_are_joined_and_a_blank_image_has_none() -> None:
 
 
 def test_a_pipe_is_proposed_where_its_contour_lines_agree(pipe_views: list[View]) -> None:
-    found = propose(pipe_views, cloud(PIPE), RADII, [], 5)
+    found = proposed(pipe_views, cloud(PIPE), RADII, [])
     assert found
     offset = found[0].middle - PIPE.start
     assert np.linalg.norm(np.cross(offset, PIPE.axis)) < PIPE.radius
@@ -53,11 +58,11 @@ def test_a_pipe_is_proposed_where_its_contour_lines_agree(pipe_views: list[View]
 
 def test_known_pipes_and_strips_on_the_wall_are_not_proposed(pipe_views: list[View], empty_views: list[View]) -> None:
     wide = Cylinder(PIPE.start - 0.1 * PIPE.axis, PIPE.end + 0.1 * PIPE.axis, 1.5 * PIPE.radius)
-    for cylinder in propose(pipe_views, cloud(PIPE), RADII, [wide], 5):
+    for cylinder in proposed(pipe_views, cloud(PIPE), RADII, [wide]):
         offset = cylinder.middle - PIPE.start
         assert np.linalg.norm(np.cross(offset, PIPE.axis)) > PIPE.radius
-    assert propose(empty_views, cloud(), [SHADOW_RADIUS], [], 5) == []
-    assert propose([], cloud(), RADII, [], 5) == []
+    assert proposed(empty_views, cloud(), [SHADOW_RADIUS], []) == []
+    assert proposed([], cloud(), RADII, []) == []
 
 
 def test_the_contour_of_a_strip_stays_where_it_is(pipe_views: list[View]) -> None:

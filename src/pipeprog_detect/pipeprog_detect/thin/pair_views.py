@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The segment pairs of all keyframes that are far enough apart, with the depths that the cloud gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.silhouette.apparent_contour import project
+from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line
+from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
+from pipeprog_detect.types import Cylinder, View
+
+# Baseline from view to view, as a share of the median depth of what they see, and number of views at the most.
+STEP, MOST_VIEWS = 0.12, 120
+# Half of a thin pipe's width [px] that suffices to see its two sides: larger images are reduced.
+ENOUGH = 4.5
+# Standard deviations of a segment pair's centre line and width [px], shading and shadows beside the pipe included.
+CENTRE_SIGMA, WIDTH_SIGMA = 1.0, 1.2
+
+
+@dataclass(frozen=True)
+class PairView:
+    """One view at the size at which lines were sought, its segment pairs, and the depths [m] of what it sees.
+
+    `before` (N, 2): depth [m] of the cloud at the segment pairs' ends, NaN where the cloud does not show them.
+    """
+
+    view: View
+    pairs: SegmentPairs
+    depth: tuple[float, float]
+    before: FloatArray
+
+
+def pair_views(
+    views: Sequence[View],
+    points: NDArray[np.float32],
+    radii: Sequence[float],
+    known: Sequence[Cylinder],
+    edges: dict[tuple[int, int], FloatArray],
+) -> list[PairView]:
+    """Those of the views that tell more than the one before, each with the segment pairs that may be thin pipes.
+
+    Args:
+        views: the keyframes.
+        points: of the cloud (N, 3); they bound the depths of each view.
+        radii: of thin pipes [m].
+        known: cylinders in whose silhouettes no segment pairs are sought.
+        edges: straight edges that earlier calls found, by stamp and width; new ones are added.
+    """
+    seen = (_pair_view(view, points, radii, known, edges) for view in _apart(views, points))
+    return [each for each in seen if each is not None]
+
+
+def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
+    """Views of the cloud's points far enough from the last one to tell more than it did."""
+    chosen: list[View] = []
+    sparse = points[:: max(len(points) // 5000, 1)]
+    for view in views:
+        depth = _points_in(view, sparse)[1]
+        if len(depth) and (
+            not chosen or np.linalg.norm(view.centre - chosen[-1].centre) > STEP * float(np.median(depth))
+        ):
+            chosen.append(view)
+    return chosen[:: -(-len(chosen) // MOST_VIEWS)] if chosen else []
+
+
+def _pair_view(
+    view: View,
+    points: NDArray[np.float32],
+    radii: Sequence[float],
+    known: Sequence[Cylinder],
+    lines: dict[tuple[int, int], FloatArray],
+) -> PairView | None:
+    pixel, depth = _points_in(view, points)
+    if len(depth) < 100:
+        return None
+    near, middle, far = np.percentile(depth[:: max(len(depth) // 5000, 1)], [1, 50, 99])
+    scale = min(1.0, ENOUGH * middle / (min(radii) * view.camera.fx))
+    scale = 2.0 ** (round(4.0 * np.log2(scale)) / 4.0)  # few sizes, so that edges found before serve again
+    if scale < 1.0:
+        width, height = (max(round(scale * side), 1) for side in (view.camera.width, view.camera.height))
+        image = np.asarray(cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        view = replace(view, image=image, camera=view.camera.scaled(scale))
+        pixel = (pixel + 0.5) * scale - 0.5
+    focal = view.camera.fx
+    narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
+    key = (view.stamp, view.camera.width)
+    if key not in lines:
+        lines[key] = straight_edges(view.image)
+    found = segment_pairs(lines[key], max(narrowest, 2.0), widest)
+    within = np.zeros(len(found), bool)
+    for cylinder in known:
+        within |= _within_silhouette(found, cylinder, view)
+    found = found.select(~within)
+    before, flat = _cloud_depths(found, pixel, depth, min(radii))
+    return PairView(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
+
+
+def _cloud_depths(
+    found: SegmentPairs, pixel: NDArray[np.float32], depth: NDArray[np.float32], radius: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Depth [m] of the cloud at the ends (N, 2) of segment pairs that stand out from it, and which lie flat in it (N,).
+
+    A pipe that touches a wall stands out from it by its diameter, a painted strip, a joint or a shadow does not.
+    Stereo spreads a thin pipe in depth, towards the wall: of the points within a segment pair the nearer count. Where a
+    segment pair holds too few, depth is NaN.
+    """
+    before = np.full((len(found), 2), np.nan)
+    flat = np.zeros(len(found), bool)
+    for number in range(len(found)):
+        ends, width = found.ends[number], float(found.width[number].mean())
+        reach = BESIDE_REACH * width
+        near = ((pixel > ends.min(axis=0) - reach) & (pixel < ends.max(axis=0) + reach)).all(axis=1)
+        along = ends[1] - ends[0]
+        length = float(np.linalg.norm(along))
+        along = along / length
+        offset = pixel[near] - ends[0]
+        place, aside = offset @ along, offset @ np.array([-along[1], along[0]])
+        within = (place > 0) & (place < length)
+        bins = max(int(length / max(width, 6.0)), 3)
+        cell = np.clip((place / length * bins).astype(int), 0, bins - 1)
+        inner = within & (np.abs(aside) < 0.35 * width)
+        front = by_bin(cell[inner], depth[near][inner], bins, 30.0)
+        flanks = []
+        for side in (-1.0, 1.0):
+            beside = within & (side * aside > 1.2 * width) & (side * aside < reach)
+            flanks.append(by_bin(cell[beside], depth[near][beside], bins, 50.0))
+        known = np.isfinite(front)
+        if known.sum() < 0.5 * bins:
+            continue
+        behind = np.fmax(*flanks)
+        step = behind - front
+        judged = np.isfinite(step)
+        flat[number] = judged.sum() >= 0.5 * bins and np.median(step[judged]) < radius
+        if flat[number]:
+            continue
+        # Inverse depth is linear along the image of a line.
+        at = (np.arange(bins) + 0.5) / bins
+        slope, level = robust_line(at[known], 1.0 / front[known])
+        if level > 0 and level + slope > 0:
+            before[number] = 1.0 / level, 1.0 / (level + slope)
+    return before, flat
+
+
+def _points_in(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels (M, 2) and depths (M,) [m] of those points (N, 3) that lie within the view."""
+    pose = view.camera_from_map.astype(np.float32)
+    camera = view.camera
+    depth = points @ pose[2, :3] + pose[2, 3]
+    front = depth > 0.05
+    points, depth = points[front], depth[front]
+    x = camera.fx * (points @ pose[0, :3] + pose[0, 3]) / depth + camera.cx
+    y = camera.fy * (points @ pose[1, :3] + pose[1, 3]) / depth + camera.cy
+    inside = (x > 0) & (y > 0) & (x < camera.width - 1) & (y < camera.height - 1)
+    return np.stack([x[inside], y[inside]], axis=1), depth[inside]
+
+
+def _within_silhouette(found: SegmentPairs, cylinder: Cylinder, view: View) -> NDArray[np.bool_]:
+    """Segment pairs (N,) whose both ends lie within the silhouette of a cylinder."""
+    ends, depth = project(view, np.stack([cylinder.start, cylinder.end]))
+    if (depth < 0.05).any():
+        return np.zeros(len(found), bool)
+    along = ends[1] - ends[0]
+    length = float(np.linalg.norm(along)) + 1e-9
+    along = along / length
+    offset = found.ends - ends[0]
+    place = offset @ along
+    aside = np.abs(offset @ np.array([-along[1], along[0]]))
+    reach = view.camera.fx * cylinder.radius / depth.min()
+    return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
+
+
+def rays(pair_view: PairView) -> FloatArray:
+    """Directions (N, 2, 3) with unit depth, in the camera's frame, of the segment pairs' ends."""
+    camera = pair_view.view.camera
+    ends = pair_view.pairs.ends
+    x = (ends[..., 0] - camera.cx) / camera.fx
+    y = (ends[..., 1] - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def centre_lines(found: SegmentPairs) -> FloatArray:
+    """Lines (N, 3) through the segment pairs' ends with unit normals: line . (x, y, 1) is the distance [px]."""
+    along = found.ends[:, 1] - found.ends[:, 0]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
+    return np.concatenate([normal, -np.einsum("ij,ij->i", normal, found.ends[:, 0])[:, None]], axis=1)
