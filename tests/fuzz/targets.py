@@ -12,8 +12,11 @@ import re
 import shutil
 import tempfile
 import typing
+import zipfile
 from collections.abc import Callable, Iterator
+from datetime import date
 from functools import cache, partial
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ import numpy as np
 import pye57
 import yaml
 from mcap.writer import CompressionType
+from openpyxl import Workbook
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 from rclpy.serialization import deserialize_message, serialize_message
@@ -106,6 +110,8 @@ def targets() -> dict[str, Target]:
     files = [
         Target("bag", ".mcap", partial(_damaged, _bags), _read_bag),
         Target("boq", ".yaml", partial(_spoiled_text, _boqs), load_boq),
+        Target("boq_csv", ".csv", partial(_spoiled_text, _bill_tables), load_boq),
+        Target("boq_xlsx", ".xlsx", partial(_damaged, _workbooks), load_boq),
         Target("board", ".yaml", partial(_spoiled_text, _boards), load_board_file),
         Target("calibration", ".yaml", partial(_spoiled_text, _calibrations), read_camera),
         Target("metadata", ".yaml", partial(_spoiled_text, _metadata), _read_folder),
@@ -160,6 +166,34 @@ def _bags() -> list[bytes]:
         mcap_bytes(messages, compression, enable_crcs=crc) for compression in CompressionType for crc in (True, False)
     ]
     return [*bags, mcap_bytes(messages, use_chunking=False), mcap_bytes(raw, CompressionType.NONE, enable_crcs=False)]
+
+
+@cache
+def _bill_tables() -> list[bytes]:
+    english = "name,outer diameter [mm],planned length [m],zone\nA,60.3,1906.5,1\nB,114.3,8.60,2\n"
+    german = "Bezeichnung;Durchmesser (mm);L\u00e4nge (m);Beginn\nA;60,3;1.906,5;1.3.2026\nB;114,3;8,60;\n"
+    return [english.encode(), german.encode("utf-8-sig")]
+
+
+@cache
+def _workbooks() -> list[bytes]:
+    """Workbooks with their parts inflated, so that damage reaches the reader behind the archive, and as saved."""
+    content = []
+    for compression in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        book = Workbook()
+        for row in (
+            ("name", "outer diameter [mm]", "planned length [m]", "start"),
+            ("A", 60.3, 24.5, date(2026, 3, 2)),
+        ):
+            book.active.append(row)
+        saved = BytesIO()
+        book.save(saved)
+        again = BytesIO()
+        with zipfile.ZipFile(saved) as archive, zipfile.ZipFile(again, "w", compression) as copy:
+            for name in archive.namelist():
+                copy.writestr(name, archive.read(name))
+        content.append(again.getvalue())
+    return content
 
 
 @cache

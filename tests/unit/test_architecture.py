@@ -50,7 +50,8 @@ FOLDERS = {
     "pipeprog_detect": {
         "cloud": set(),
         "silhouette": {"cloud"},
-        "product": set(),
+        "plan": set(),
+        "product": {"plan"},
         "verification": {"cloud", "silhouette", "product"},
         "thin": {"cloud", "silhouette", "product", "verification"},
     },
@@ -87,6 +88,7 @@ DEPENDENCIES = {
     "mcap": None,
     "mcap_ros2": None,
     "open3d": None,
+    "openpyxl": None,
     "plyfile": None,
     "pye57": None,
     "pycolmap": None,

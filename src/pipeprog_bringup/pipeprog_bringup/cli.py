@@ -26,7 +26,9 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-Boq = Annotated[Path, typer.Option("--boq", help="Bill of quantities (YAML): the planned classes.", metavar="BOQ.yaml")]
+Boq = Annotated[
+    Path, typer.Option("--boq", help="Bill of quantities: the planned classes.", metavar="BOQ.yaml|csv|xlsx")
+]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.", metavar="DIR")]
 Force = Annotated[bool, typer.Option("--force", help="Replace the results that --out holds.")]
 Set = Annotated[

@@ -53,6 +53,11 @@ MAX_SECONDS = 2**31 - 1  # s; builtin_interfaces/Time has 32 bits with a sign
 
 # Bills of quantities, board files and results.
 MAX_CLASSES = 1000  # planned classes; all sizes of EN 10220 in all their walls are 600
+MAX_BILL_ROWS = 5000  # of a table; MAX_CLASSES with headings, sums and empty rows between them
+MAX_BILL_COLUMNS = 256  # of a table; a bill has twenty
+MAX_SHEETS = 32  # of a workbook that are looked through; a project's bill has one for each trade
+MAX_XLSX = 16 << 20  # bytes of a workbook; MAX_BILL_ROWS of 20 columns take 1 MB
+MAX_XLSX_CONTENT = 64 << 20  # bytes that a workbook inflates to; tables inflate tenfold, openpyxl reads 8 MB a second
 MAX_PIPE_RADIUS = 50.0  # m; tunnels have 9
 MIN_PIPE_RADIUS = 1e-4  # m; capillaries have 0.5 mm, and no camera sees them as pipes
 MAX_PIPE_LENGTH = 1e7  # m of one class; the Earth's quarter

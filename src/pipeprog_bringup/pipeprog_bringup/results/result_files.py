@@ -24,7 +24,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_TABLE
 from pipeprog_camera.outside_text import for_spreadsheet, shown
 from pipeprog_camera.text_file import read_text
-from pipeprog_detect.product.boq import BillOfQuantities
+from pipeprog_detect.product.boq import BillLine, BillOfQuantities, PipeClass
 from pipeprog_detect.product.pipe_runs import PipeRun
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Pipe
@@ -147,9 +147,22 @@ def boq_entries(boq: BillOfQuantities) -> list[dict[str, Any]]:
             "outer_radius_mm": round(1e3 * planned.outer_radius, 6),
             "planned_length_m": planned.planned_length,
             "color": "#" + "".join(f"{round(255 * part):02x}" for part in planned.color),
+            **({"lines": [_line_entry(line) for line in planned.lines]} if _has_details(planned) else {}),
         }
         for planned in boq.classes
     ]
+
+
+def _has_details(planned: PipeClass) -> bool:
+    """Whether the lines of a class say more than the class itself."""
+    return len(planned.lines) > 1 or any(len(_line_entry(line)) > 2 for line in planned.lines)
+
+
+def _line_entry(line: BillLine) -> dict[str, Any]:
+    """A line of the bill by the keys of BOQ.yaml, without what is not given."""
+    details = {key: getattr(line, key) for key in ("system", "zone", "activity", "start", "finish")}
+    given = {key: text for key, text in details.items() if text}
+    return {"name": line.name, "planned_length_m": line.planned_length, **given}
 
 
 def package_version(name: str) -> str | None:

@@ -1,52 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bill of quantities: which pipe classes are planned, how thick, how many metres."""
+"""The bill of quantities: which pipe classes are planned, how thick, how many metres, and where if it says so."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import MAX_CLASSES, MAX_PIPE_LENGTH, MAX_PIPE_RADIUS, MIN_PIPE_RADIUS
+from pipeprog_camera.limits import MAX_CLASSES, MAX_NAME, MAX_PIPE_LENGTH, MAX_PIPE_RADIUS, MIN_PIPE_RADIUS
 from pipeprog_camera.outside_text import name_of, nearest, shown
-from pipeprog_camera.yaml_file import line_of, read_yaml
+from pipeprog_detect.plan.entry import Entry, Segment
+from pipeprog_detect.plan.plan_file import read_plan
+from pipeprog_detect.product.class_colors import Color, distinct_colors, read_color
 from pipeprog_detect.product.standard_sizes import find_size, nearest_name
-
-Color = tuple[float, float, float]
+from pipeprog_detect.product.unit_check import WrittenSize, ask_about_units
+from pipeprog_detect.types import Cylinder
 
 # Outer radius is toleranced to about half a percent of the diameter either way (EN 10220), and paint adds to it.
 _RELATIVE_TOLERANCE = 0.01
 _LEAST_TOLERANCE = 1e-4
-
-# Names without matplotlib's values, and at once; its other names of CSS are taken, too.
-NAMED_COLORS: dict[str, Color] = {
-    "black": (0.0, 0.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-    "brown": (0.65, 0.16, 0.16),
-    "cyan": (0.0, 1.0, 1.0),
-    "gray": (0.5, 0.5, 0.5),
-    "green": (0.0, 0.5, 0.0),
-    "grey": (0.5, 0.5, 0.5),
-    "lime": (0.0, 1.0, 0.0),
-    "magenta": (1.0, 0.0, 1.0),
-    "maroon": (0.5, 0.0, 0.0),
-    "navy": (0.0, 0.0, 0.5),
-    "olive": (0.5, 0.5, 0.0),
-    "orange": (1.0, 0.65, 0.0),
-    "pink": (1.0, 0.75, 0.8),
-    "purple": (0.5, 0.0, 0.5),
-    "red": (1.0, 0.0, 0.0),
-    "silver": (0.75, 0.75, 0.75),
-    "teal": (0.0, 0.5, 0.5),
-    "white": (1.0, 1.0, 1.0),
-    "yellow": (1.0, 1.0, 0.0),
-}
-# Colours by outer radius [m] of the paper's Figure 11, then others told apart from them.
-_FIGURE_11 = {0.0086: "magenta", 0.0365: "blue", 0.0575: "cyan", 0.0841: "green", 0.1095: "red", 0.1223: "yellow"}
-_OTHERS = ("orange", "purple", "lime", "brown", "teal", "pink", "navy", "olive", "maroon", "silver")
 
 # Sewer pipes of PVC (EN 1401) have walls of a 34th to a 41st of the diameter; half of the range is two standard
 # deviations of the bore's radius. A bill of quantities of sewers may also give the bores themselves as its sizes: these
@@ -54,8 +30,24 @@ _OTHERS = ("orange", "purple", "lime", "brown", "teal", "pink", "navy", "olive",
 _WALL_SHARE, _WALL_SPREAD = 0.5 * (2 / 34 + 2 / 41), 0.004
 _BORE_TOLERANCE = 0.005
 
+_NO_COLOR: Color = (0.5, 0.5, 0.5)  # until all classes are known
 _SIZE_KEYS = ("outer_radius_mm", "outer_diameter_mm", "size")
-_KEYS = ("name", *_SIZE_KEYS, "wall_mm", "planned_length_m", "color")
+_LINE_KEYS = ("system", "zone", "activity")  # these tell lines of one size apart
+_DATE_KEYS = ("start", "finish")
+_KEYS = ("name", *_SIZE_KEYS, "wall_mm", "planned_length_m", "color", *_LINE_KEYS, *_DATE_KEYS)
+
+
+@dataclass(frozen=True)
+class BillLine:
+    """A line of the bill: name and planned length [m]; system, zone, activity and ISO dates are empty if not given."""
+
+    name: str
+    planned_length: float
+    system: str = ""
+    zone: str = ""
+    activity: str = ""
+    start: str = ""
+    finish: str = ""
 
 
 @dataclass(frozen=True)
@@ -63,6 +55,7 @@ class PipeClass:
     """A planned class: outer radius and its tolerance (one standard deviation) [m], planned length [m], RGB in 0..1.
 
     wall [m] is the thickness of its wall, None where it is not given; a camera inside sees the bore.
+    lines are those of the bill that have this size: two systems of one size are one class, since its pipes look alike.
     """
 
     name: str
@@ -71,6 +64,7 @@ class PipeClass:
     color: Color
     tolerance: float
     wall: float | None = None
+    lines: tuple[BillLine, ...] = ()
 
     @property
     def bores(self) -> tuple[tuple[float, float], ...]:
@@ -84,10 +78,22 @@ class PipeClass:
 
 
 @dataclass(frozen=True)
+class PlannedPipe:
+    """A pipe of a plan that has places: GUID, name, place in the plan's coordinates; its class, its line in that."""
+
+    id: str
+    name: str
+    cylinder: Cylinder
+    class_name: str
+    line: int
+
+
+@dataclass(frozen=True)
 class BillOfQuantities:
-    """The planned classes, in the order of the file."""
+    """The planned classes, in the order of the file, and the planned pipes where the plan has their places."""
 
     classes: tuple[PipeClass, ...]
+    pipes: tuple[PlannedPipe, ...] = ()
 
     @classmethod
     def of_radii(cls, radii: Mapping[str, float]) -> BillOfQuantities:
@@ -96,7 +102,7 @@ class BillOfQuantities:
         Raises InputError where there is no class or a radius is no length.
         """
         classes = [
-            PipeClass(name, radius, math.nan, (0.5, 0.5, 0.5), max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE))
+            PipeClass(name, radius, math.nan, _NO_COLOR, max(_RELATIVE_TOLERANCE * radius, _LEAST_TOLERANCE))
             for name, radius in radii.items()
             if _positive(f"radii: class {shown(name)}", "the outer radius in metres", radius)
         ]
@@ -105,70 +111,152 @@ class BillOfQuantities:
         return cls(_with_colors(classes, [None] * len(classes)))
 
 
-def load_boq(path: str | Path) -> BillOfQuantities:
-    """Read BOQ.yaml (`classes:` with name, planned_length_m, color and a size).
+@dataclass(frozen=True)
+class _Item:
+    """An entry that was checked: its class with its one line, its colour where one is given, its planned pipes."""
 
-    The size is outer_radius_mm, outer_diameter_mm or `size`, a standard one such as `DN50 steel` (see sizes).
+    where: str
+    planned: PipeClass
+    color: Color | None
+    written: WrittenSize | None
+    segments: tuple[Segment, ...]
+
+
+def load_boq(path: str | Path) -> BillOfQuantities:
+    """Read a bill of quantities from YAML, CSV or XLSX, as docs/files.md describes it; the same checks hold for all.
+
+    The size is outer_radius_mm, outer_diameter_mm or `size`, a standard one such as `DN50 steel` (see sizes). Lines of
+    one size that differ in system, zone or activity make one class.
 
     Raises InputError, naming the file, the value and the remedy, for anything that is no bill of quantities.
     """
     path = Path(path)
-    content = read_yaml(path)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no mapping: a bill of quantities begins with 'classes:'")
-    _refuse_unknown(str(path), "the file", content, ("classes",))
-    entries = content.get("classes")
-    if not isinstance(entries, list) or not entries:
-        raise InputError(
-            f"{path}{line_of(content, 'classes')}: classes is {shown(entries)}: "
-            "list at least one class with name, radius and planned length"
-        )
+    entries = read_plan(path)
     if len(entries) > MAX_CLASSES:
         raise InputError(f"{path}: {len(entries)} classes: plan {MAX_CLASSES} at most, or split the bill by trades")
-    classes: list[PipeClass] = []
-    colors: list[Color | None] = []
-    for number, entry in enumerate(entries):
-        where = f"{path}{line_of(entries, number)}"
-        new = _read_class(where, number + 1, entry)
-        _refuse_double(where, new, classes)
-        classes.append(new)
-        colors.append(_read_color(f"{where}: class {shown(new.name)}", entry["color"]) if "color" in entry else None)
-    return BillOfQuantities(_with_colors(classes, colors))
-
-
-def _refuse_double(where: str, new: PipeClass, classes: list[PipeClass]) -> None:
-    for old in classes:
-        if old.name == new.name:
+    items = [_read_item(entry, number) for number, entry in enumerate(entries, 1)]
+    ask_about_units([item.written for item in items if item.written is not None])
+    for item in items:
+        if item.planned.outer_radius < MIN_PIPE_RADIUS:
             raise InputError(
-                f"{where}: class {shown(new.name)} is listed twice: keep one, or give the other its own name"
+                f"{item.where}: an outer radius of {item.planned.outer_radius:g} m is that of no pipe: "
+                "write millimetres"
             )
-        if math.isclose(old.outer_radius, new.outer_radius, rel_tol=1e-6):
-            raise InputError(
-                f"{where}: classes {shown(old.name)} and {shown(new.name)} have the same outer radius "
-                f"{1e3 * new.outer_radius:g} mm and cannot be told apart: merge them"
-            )
+    return _grouped(items)
 
 
-def _read_class(where: str, number: int, entry: object) -> PipeClass:
+def _grouped(items: Sequence[_Item]) -> BillOfQuantities:
+    """The bill of all items; those of one size become one class of several lines."""
+    groups: list[list[_Item]] = []
+    for item in items:
+        group = next((group for group in groups if _same_size(group[0], item)), None)
+        _refuse_double(item, group or [], [other for other in groups if other is not group])
+        if group is None:
+            groups.append([item])
+        else:
+            group.append(item)
+    classes = [_joined([item.planned for item in group]) for group in groups]
+    colors = [next((item.color for item in group if item.color is not None), None) for group in groups]
+    pipes = [
+        PlannedPipe(one.id, one.name, Cylinder(one.start, one.end, item.planned.outer_radius), planned.name, line)
+        for planned, group in zip(classes, groups, strict=True)
+        for line, item in enumerate(group)
+        for one in item.segments
+    ]
+    return BillOfQuantities(_with_colors(classes, colors), tuple(pipes))
+
+
+def _same_size(one: _Item, other: _Item) -> bool:
+    return math.isclose(one.planned.outer_radius, other.planned.outer_radius, rel_tol=1e-6)
+
+
+def _refuse_double(item: _Item, group: Sequence[_Item], other_sizes: Sequence[Sequence[_Item]]) -> None:
+    """Raises InputError where nothing tells an item from one of its size, or where another size has its name."""
+    (new,) = item.planned.lines
+    alike = [line for other in group for line in other.planned.lines if _same_place(line, new)]
+    if any(line.name == new.name for line in alike) or any(
+        other.planned.name == new.name for others in other_sizes for other in others
+    ):
+        raise InputError(
+            f"{item.where}: class {shown(new.name)} is listed twice: keep one, or give the other its own name"
+        )
+    if alike:
+        raise InputError(
+            f"{item.where}: classes {shown(alike[0].name)} and {shown(new.name)} have the same outer radius "
+            f"{1e3 * item.planned.outer_radius:g} mm and cannot be told apart: merge them, or give each its system, "
+            "zone or activity"
+        )
+
+
+def _same_place(one: BillLine, other: BillLine) -> bool:
+    return all(getattr(one, key) == getattr(other, key) for key in _LINE_KEYS)
+
+
+def _joined(classes: Sequence[PipeClass]) -> PipeClass:
+    """One class of classes of one size."""
+    first = classes[0]
+    if len(classes) == 1:
+        return first
+    names = list(dict.fromkeys(planned.name for planned in classes))
+    name = " + ".join(names)
+    return PipeClass(
+        name if len(name) <= MAX_NAME else f"{names[0][: MAX_NAME - 32]} + {len(names) - 1} others",
+        first.outer_radius,
+        math.fsum(planned.planned_length for planned in classes),
+        _NO_COLOR,
+        max(planned.tolerance for planned in classes),
+        first.wall if all(planned.wall == first.wall for planned in classes) else None,
+        tuple(line for planned in classes for line in planned.lines),
+    )
+
+
+def _read_item(given: Entry, number: int) -> _Item:
+    """Checks an entry, the number-th of its file."""
+    where, entry = given.where, given.values
     if not isinstance(entry, dict):
         raise InputError(f"{where}: class {number} is {shown(entry)}: write name, outer_radius_mm and planned_length_m")
     if "name" not in entry:
         raise InputError(f"{where}: class {number} has no name: give each class a name")
     name = name_of(entry["name"], f"{where}: the name of class {number}")
-    _refuse_unknown(where, f"class {shown(name)}", entry, _KEYS)
+    _refuse_unknown(where, name, entry)
     where = f"{where}: class {shown(name)}"
     radius, tolerance = _read_size(where, entry)
-    if not MIN_PIPE_RADIUS <= radius <= MAX_PIPE_RADIUS:
+    if radius > MAX_PIPE_RADIUS:
         raise InputError(f"{where}: an outer radius of {radius:g} m is that of no pipe: write millimetres")
+    line = _read_line(where, name, entry)
+    wall = 1e-3 * _positive(where, "wall_mm", entry["wall_mm"]) if "wall_mm" in entry else None
+    if wall is not None and wall >= radius:
+        raise InputError(f"{where}: wall_mm is {1e3 * wall:g}, more than the radius: write the wall's thickness")
+    key = next(key for key in _SIZE_KEYS if key in entry)
+    return _Item(
+        given.where,
+        PipeClass(name, radius, line.planned_length, _NO_COLOR, tolerance, wall, (line,)),
+        read_color(where, entry["color"]) if "color" in entry else None,
+        None if key == "size" else WrittenSize(given.where, name, key, float(entry[key])),
+        given.segments,
+    )
+
+
+def _read_line(where: str, name: str, entry: dict[str, object]) -> BillLine:
     if "planned_length_m" not in entry:
         raise InputError(f"{where} has no planned_length_m: give the metres that are planned")
     length = _positive(where, "planned_length_m", entry["planned_length_m"])
     if length > MAX_PIPE_LENGTH:
         raise InputError(f"{where}: planned_length_m is {length:g}: write metres, {MAX_PIPE_LENGTH:g} at most")
-    wall = 1e-3 * _positive(where, "wall_mm", entry["wall_mm"]) if "wall_mm" in entry else None
-    if wall is not None and wall >= radius:
-        raise InputError(f"{where}: wall_mm is {1e3 * wall:g}, more than the radius: write the wall's thickness")
-    return PipeClass(name, radius, length, (0.5, 0.5, 0.5), tolerance, wall)
+    system, zone, activity = (name_of(entry[key], f"{where}: {key}") if key in entry else "" for key in _LINE_KEYS)
+    start, finish = (_read_day(f"{where}: {key}", entry[key]) if key in entry else "" for key in _DATE_KEYS)
+    if start and finish and finish < start:
+        raise InputError(f"{where}: finish {finish} lies before start {start}: mend one of them")
+    return BillLine(name, length, system, zone, activity, start, finish)
+
+
+def _read_day(where: str, value: object) -> str:
+    """An ISO date."""
+    text = name_of(value, where)
+    try:
+        return date.fromisoformat(text).isoformat()
+    except ValueError:
+        raise InputError(f"{where} is {shown(text)}: write the date as YYYY-MM-DD, such as 2026-03-31") from None
 
 
 def _read_size(where: str, entry: dict[str, object]) -> tuple[float, float]:
@@ -192,45 +280,28 @@ def _read_size(where: str, entry: dict[str, object]) -> tuple[float, float]:
 
 def _positive(where: str, key: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
+        if isinstance(value, str) and re.fullmatch(r"\d+,\d+", value):
+            raise InputError(f"{where}: {key} is {shown(value)}: write {value.replace(',', '.')}, with a decimal point")
         raise InputError(f"{where}: {key} is {shown(value)}: write a number")
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{where}: {key} is {shown(value)}: write a number above zero")
     return float(value)
 
 
-def _refuse_unknown(where: str, what: str, entry: dict[object, object], known: tuple[str, ...]) -> None:
+def _refuse_unknown(where: str, name: str, entry: dict[object, object]) -> None:
     for key in entry:
-        if key not in known:
-            raise InputError(f"{where}: unknown key {shown(key)} in {what}: did you mean '{nearest(key, known)}'?")
+        if key in _KEYS:
+            continue
+        if isinstance(key, int) and entry[key] is None:  # `{outer_radius_mm: 57,5}` is 57 and a key 5
+            raise InputError(
+                f"{where}: class {shown(name)}: {key} stands alone: is it behind a decimal comma? Write 57.5 for 57,5"
+            )
+        raise InputError(
+            f"{where}: unknown key {shown(key)} in class {shown(name)}: did you mean '{nearest(key, _KEYS)}'?"
+        )
 
 
-def _with_colors(classes: list[PipeClass], given: list[Color | None]) -> tuple[PipeClass, ...]:
-    """The classes with the colours that are given (None: by outer radius, else one that tells them apart)."""
-    colors: list[Color | None] = []
-    for new, color in zip(classes, given, strict=True):
-        known = [name for radius, name in _FIGURE_11.items() if abs(radius - new.outer_radius) < 2e-4]
-        colors.append(color or (NAMED_COLORS[known[0]] if known else None))
-    spare = [NAMED_COLORS[name] for name in _OTHERS if NAMED_COLORS[name] not in colors]
-    missing = 0
-    done = []
-    for new, color in zip(classes, colors, strict=True):
-        if color is None:
-            color = spare[missing % len(spare)]
-            missing += 1
-        done.append(replace(new, color=color))
-    return tuple(done)
-
-
-def _read_color(where: str, value: object) -> Color:
-    text = name_of(value, f"{where}: color").lower()
-    if text in NAMED_COLORS:
-        return NAMED_COLORS[text]
-    if re.fullmatch(r"#[0-9a-f]{6}", text):
-        return (int(text[1:3], 16) / 255, int(text[3:5], 16) / 255, int(text[5:7], 16) / 255)
-    from matplotlib.colors import CSS4_COLORS, to_rgb  # a quarter of a second that only other names need
-
-    if text in CSS4_COLORS:
-        red, green, blue = to_rgb(text)
-        return (red, green, blue)
-    near = nearest(text, [*NAMED_COLORS, *CSS4_COLORS])
-    raise InputError(f"{where}: unknown color {shown(text)}: did you mean '{near}'? #rrggbb is fine too")
+def _with_colors(classes: Sequence[PipeClass], given: Sequence[Color | None]) -> tuple[PipeClass, ...]:
+    """The classes with the colours that are given, the others with ones that tell them apart."""
+    colors = distinct_colors([planned.outer_radius for planned in classes], given)
+    return tuple(replace(planned, color=color) for planned, color in zip(classes, colors, strict=True))

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.product.boq import NAMED_COLORS, load_boq
+from pipeprog_detect.product.boq import load_boq
+from pipeprog_detect.product.class_colors import NAMED_COLORS
 
 
 def written(folder: Path, text: str) -> Path:

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One class of a plan as every reader gives it, whatever the kind of the file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeprog_camera.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A planned straight pipe.
+
+    Attributes:
+        id: its GUID in the plan.
+        name: as people know it.
+        start, end: of its axis, (3,) [m], in the plan's coordinates.
+    """
+
+    id: str
+    name: str
+    start: FloatArray
+    end: FloatArray
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of a bill of quantities, not checked yet.
+
+    Attributes:
+        where: the file and the place in it, for errors.
+        values: what it says, by the keys of BOQ.yaml (docs/files.md); whatever the file holds where a mapping belongs.
+        segments: the planned pipes that it sums up, where the plan has their places.
+    """
+
+    where: str
+    values: object
+    segments: tuple[Segment, ...] = ()
