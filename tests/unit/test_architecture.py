@@ -59,7 +59,7 @@ FOLDERS = {
         "recording": set(),
         "clouds": set(),
         "results": {"clouds"},
-        "report": {"results"},
+        "report": {"recording", "results"},
         "view": {"report", "results"},
         "playback": {"recording", "results"},
     },

@@ -198,7 +198,7 @@ def report(
     ],
     force: Annotated[bool, typer.Option("--force", help="Replace the page that --out names.")] = False,
 ) -> None:
-    """Write one HTML page: progress of each class, pictures, trajectory, radii, all pipes."""
+    """Write one HTML page: progress of each class, a 3-D view, each pipe with its photographs, plan and elevations."""
     from pipeprog_bringup.console import share_bar
     from pipeprog_bringup.report.page import report as write
 

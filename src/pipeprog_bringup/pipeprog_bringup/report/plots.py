@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
+from itertools import cycle
 
 import matplotlib as mpl
 import numpy as np
@@ -19,29 +20,6 @@ from matplotlib import dates
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-
-
-def plan(survey: Survey) -> Figure:
-    """Pipes and the camera's path seen from above."""
-    figure, axes = plt.subplots(figsize=(10, 5.5))
-    for pipe in survey.pipes:
-        cylinder = survey.cylinder(pipe)
-        color = survey.color(pipe["class"])
-        x, y = np.array([cylinder.start, cylinder.end])[:, :2].T
-        if np.hypot(*np.diff([x, y])) < cylinder.radius:
-            axes.add_patch(plt.Circle((x.mean(), y.mean()), cylinder.radius, facecolor=color, edgecolor="#333", lw=0.8))
-        else:
-            axes.plot(x, y, color="#333", lw=4.6, solid_capstyle="butt")
-            axes.plot(x, y, color=color, lw=3.4, solid_capstyle="butt")
-        axes.annotate(for_plot(pipe["id"]), (x.mean(), y.mean()), (4, 5), textcoords="offset points", fontsize=8)
-    if survey.positions is not None:
-        x, y = survey.positions[:, :2].T
-        axes.plot(x, y, "-", color="#d9822b", lw=1.2, marker="o", ms=3, label="camera")
-        axes.plot(x[0], y[0], ">", color="#d9822b", ms=9, label="start")
-        axes.legend(frameon=False, fontsize=9)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x [m]", ylabel="y [m]")
-    return _finished(figure)
 
 
 def radii_and_classes(survey: Survey) -> Figure:
@@ -110,12 +88,15 @@ def series(surveys: Sequence[Survey]) -> Figure:
     figure, axes = plt.subplots(figsize=(10, 4.2))
     times = [survey.time for survey in surveys]
     names = dict.fromkeys(str(entry["class"]) for survey in surveys for entry in survey.classes)
-    for name in names:
+    # Each class has a mark of its own beside its colour.
+    for name, mark in zip(names, cycle("os^Dv<>PX*"), strict=False):
         own = [next((c for c in survey.classes if str(c["class"]) == name), None) for survey in surveys]
         installed = [np.nan if entry is None else float(entry["installed_m"]) for entry in own]
         last = next(entry for entry in reversed(own) if entry is not None)
         color = surveys[-1].color(name)
-        axes.plot(times, installed, "-o", color=color, lw=2, ms=6, mec="#333", mew=0.6, label=for_plot(name))
+        axes.plot(
+            times, installed, "-", marker=mark, color=color, lw=2, ms=7, mec="#333", mew=0.6, label=for_plot(name)
+        )
         axes.axhline(float(last["planned_m"]), color=color, lw=1, ls=":")
     axes.set(ylabel="installed [m] (dotted: planned)")
     axes.set_ylim(bottom=0)

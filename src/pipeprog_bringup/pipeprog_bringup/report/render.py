@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeprog_bringup.results.results_reader import Color
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
-
-Color = tuple[float, float, float]
 
 # Everything is drawn twice as large and reduced, which smooths the edges.
 OVERSAMPLING = 2

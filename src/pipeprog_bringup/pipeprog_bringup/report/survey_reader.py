@@ -3,16 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeprog_bringup.report import render
-from pipeprog_bringup.results.results_reader import UNPLANNED, read_results
+from pipeprog_bringup.results.results_reader import UNPLANNED, Color, Results, read_results
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
 
@@ -22,21 +21,51 @@ FIRST_CLOCK = 1_000_000_000 * 10**9
 
 @dataclass(frozen=True)
 class Survey:
-    """A run as its folder holds it."""
+    """The results of one run, with the name and the time that the report gives them."""
 
     name: str
     time: datetime
-    pipes: list[dict[str, Any]]
-    classes: list[dict[str, Any]]
-    scale: dict[str, Any]
-    facts: dict[str, Any]
-    colors: dict[str, render.Color]
-    positions: FloatArray | None
-    cloud: Path | None = field(default=None)
+    results: Results
 
-    def color(self, name: str | None) -> render.Color:
+    @property
+    def pipes(self) -> list[dict[str, Any]]:
+        """Rows of pipes.json, one a pipe."""
+        return self.results.pipes
+
+    @property
+    def classes(self) -> list[dict[str, Any]]:
+        """Rows of pipes.json, one a planned class."""
+        return self.results.classes
+
+    @property
+    def scale(self) -> dict[str, Any]:
+        """Where the metres come from."""
+        return self.results.scale
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """run.json, how the run went."""
+        return self.results.facts
+
+    @property
+    def cylinders(self) -> list[Cylinder]:
+        """Geometry of the pipes, in their order."""
+        return self.results.cylinders
+
+    @property
+    def positions(self) -> FloatArray | None:
+        """(M, 3) places of the camera [m], None where the run has no cameras."""
+        poses = self.results.map_from_camera
+        return poses[:, :3, 3] if len(poses) else None
+
+    @cached_property
+    def installed(self) -> dict[str, float]:
+        """Metres installed of each class."""
+        return {str(entry["class"]): float(entry["installed_m"]) for entry in self.classes}
+
+    def color(self, name: str | None) -> Color:
         """Colour of a class, grey for pipes without one."""
-        return self.colors.get(name or "", UNPLANNED)
+        return self.results.colors.get(name or "", UNPLANNED)
 
     def cylinder(self, pipe: dict[str, Any]) -> Cylinder:
         """Geometry of an entry of pipes.json."""
@@ -46,25 +75,14 @@ class Survey:
 def read_survey(folder: Path) -> Survey:
     """The results of one run; only pipes.json must be there."""
     results = read_results(folder)
-    poses = results.map_from_camera
-    return Survey(
-        name=folder.resolve().name,
-        time=_time(results.stamps, results.facts, folder),
-        pipes=results.pipes,
-        classes=results.classes,
-        scale=results.scale,
-        facts=results.facts,
-        colors=results.colors,
-        positions=poses[:, :3, 3] if len(poses) else None,
-        cloud=results.cloud_path,
-    )
+    return Survey(folder.resolve().name, _time(results), results)
 
 
-def _time(stamps: NDArray, facts: dict[str, Any], folder: Path) -> datetime:
+def _time(results: Results) -> datetime:
     """When the survey was taken; for recordings without a clock, when it was worked out."""
-    if len(stamps) and stamps[0] > FIRST_CLOCK:
-        return datetime.fromtimestamp(stamps[0] * 1e-9, timezone.utc)
+    if len(results.stamps) and results.stamps[0] > FIRST_CLOCK:
+        return datetime.fromtimestamp(results.stamps[0] * 1e-9, timezone.utc)
     try:
-        return datetime.fromisoformat(str(facts["finished"])).astimezone(timezone.utc)
+        return datetime.fromisoformat(str(results.facts["finished"])).astimezone(timezone.utc)
     except (KeyError, OverflowError, ValueError):  # none, no date, or one at an end of the calendar
-        return datetime.fromtimestamp((folder / "pipes.json").stat().st_mtime, timezone.utc)
+        return datetime.fromtimestamp((results.folder / "pipes.json").stat().st_mtime, timezone.utc)
