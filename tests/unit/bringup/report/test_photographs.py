@@ -52,7 +52,7 @@ def test_the_whole_pipe_comes_before_a_part_and_what_hides_it_counts() -> None:
 
 
 def test_no_outline_from_inside_a_pipe() -> None:
-    assert len(outline(UPRIGHT, UPRIGHT.middle + [0.01, 0.0, 0.0])) == 0
+    assert len(outline(UPRIGHT, UPRIGHT.at(np.array([0.5]))[0])) == 0
 
 
 def test_without_keyframes_the_reason_is_told(tmp_path: Path) -> None:
