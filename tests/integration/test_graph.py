@@ -159,6 +159,7 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
         assert pipe.keys() == {
             *("id", "start", "end", "radius", "radius_sigma", "length"),
             *("class", "class_probability", "class_kmeans", "ambiguous", "visible_arc_deg", "rmse", "points"),
+            *("length_sigma", "ends"),
         }
         # Each coordinate and the length are rounded to the micrometre.
         assert pipe["length"] == pytest.approx(np.linalg.norm(np.subtract(pipe["end"], pipe["start"])), abs=3e-6)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -71,16 +72,18 @@ def print_progress(product: Product) -> None:
     """Planned and installed metres of each class; a last row for the pipes of no planned class."""
     table = Table(title="Progress", title_justify="left")
     table.add_column("class")
-    for name in ("outer radius [mm]", "pipes", "installed [m]", "planned [m]", "%"):
+    for name in ("outer radius [mm]", "pipes", "installed [m]", "± sigma [m]", "planned [m]", "%"):
         table.add_column(name, justify="right")
     for entry in product.classes:
         count = sum(pipe.class_name == entry.name for pipe in product.pipes)
-        lengths = (f"{entry.installed:.2f}", f"{entry.planned:.2f}", f"{entry.percent:.1f}")
+        sigma = product.installed_sigma(entry.name)
+        sigma_text = f"{sigma:.3f}" if math.isfinite(sigma) else "-"
+        lengths = (f"{entry.installed:.2f}", sigma_text, f"{entry.planned:.2f}", f"{entry.percent:.1f}")
         table.add_row(_name(entry.name), f"{1e3 * entry.outer_radius:.1f}", str(count), *lengths)
     others = [pipe for pipe in product.pipes if pipe.class_name is None]
     if others:
         total = sum(pipe.cylinder.length for pipe in others)
-        table.add_row("[dim]no planned class", "", str(len(others)), f"{total:.2f}", "", "")
+        table.add_row("[dim]no planned class", "", str(len(others)), f"{total:.2f}", "", "", "")
     output_console().print(table)
 
 

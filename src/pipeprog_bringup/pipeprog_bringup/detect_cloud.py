@@ -48,7 +48,7 @@ def detect_file(
         read = time.time()
         pipes = detect(file.cloud, boq, config, (), report)
         timings = {"read": read - started, "detect": time.time() - read}
-        detection = Detection(product_of(pipes, boq), len(file.cloud.points), file.dropped)
+        detection = Detection(product_of(pipes, boq, 0.0), len(file.cloud.points), file.dropped)
         _write(folder, detection, cloud_path, boq, config, timings)
     return detection
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -125,14 +126,15 @@ class PipeOutput:
     def publish(self, product: Product, status: ReceivedStatus) -> None:
         """The product of a map."""
         header = messages.header(status.stamp, "map")
+        product = replace(product, scale_sigma=status.scale_sigma)
         self._array.publish(
             msg.PipeArray(
                 header=header,
                 map_revision=status.revision,
                 scale_source=status.scale_source,
                 scale_sigma=status.scale_sigma,
-                pipes=[_pipe_msg(pipe) for pipe in product.pipes],
-                classes=[_progress_msg(row, self._boq) for row in product.classes],
+                pipes=[_pipe_msg(pipe, product) for pipe in product.pipes],
+                classes=[_progress_msg(row, product, self._boq) for row in product.classes],
                 runs=[_run_msg(run) for run in product.runs],
             )
         )
@@ -293,7 +295,8 @@ class DetectNode(Node):
         return DiagnosticStatus.OK, "detecting" if self._revision else "waiting for a map", values
 
 
-def _pipe_msg(pipe: Pipe) -> msg.Pipe:
+def _pipe_msg(pipe: Pipe, product: Product) -> msg.Pipe:
+    start, end = pipe.ends
     return msg.Pipe(
         id=pipe.id,
         start=_point(pipe.cylinder.start),
@@ -306,6 +309,11 @@ def _pipe_msg(pipe: Pipe) -> msg.Pipe:
         visible_arc=pipe.visible_arc,
         rmse=pipe.rmse,
         points=pipe.points,
+        length_sigma=product.length_sigma(pipe),
+        start_sigma=start.sigma,
+        end_sigma=end.sigma,
+        start_state=start.state,
+        end_state=end.state,
     )
 
 
@@ -352,13 +360,14 @@ def _point(position: NDArray[np.float64]) -> Point:
     return Point(x=x, y=y, z=z)
 
 
-def _progress_msg(row: ClassProgress, boq: BillOfQuantities) -> msg.ClassProgress:
+def _progress_msg(row: ClassProgress, product: Product, boq: BillOfQuantities) -> msg.ClassProgress:
     color = next(planned.color for planned in boq.classes if planned.name == row.name)
     return msg.ClassProgress(
         class_name=row.name,
         outer_radius=row.outer_radius,
         planned_length=row.planned,
         installed_length=row.installed,
+        installed_sigma=product.installed_sigma(row.name),
         color=ColorRGBA(r=color[0], g=color[1], b=color[2], a=1.0),
     )
 

@@ -101,11 +101,30 @@ class Cylinder:
         return Cylinder(self.start + by, self.end + by, self.radius)
 
 
+# free: the images show where the barrel ends; fitting, wall: it ends there; hidden: something hides what follows from
+# all cameras; out_of_view: no image reaches further; unknown: measured in the cloud alone.
+END_STATES = ("free", "fitting", "wall", "hidden", "out_of_view", "unknown")
+
+
+@dataclass(frozen=True)
+class PipeEnd:
+    """An end of a pipe.
+
+    Attributes:
+        sigma: standard deviation of its place along the axis [m]; NaN where it is not known.
+        state: what is there, one of `END_STATES`.
+    """
+
+    sigma: float = float("nan")
+    state: str = "unknown"
+
+
 @dataclass(frozen=True)
 class Pipe:
     """A measured and classified pipe; fields as in pipeprog_msgs/Pipe (metres, radians).
 
-    `class_kmeans` depends on the radii of all pipes of a map: it is empty until these are known.
+    `class_kmeans` depends on the radii of all pipes of a map: it is empty until these are known. `ends`: its start and
+    its end.
     """
 
     id: str
@@ -117,3 +136,4 @@ class Pipe:
     rmse: float
     points: int
     class_kmeans: str = ""
+    ends: tuple[PipeEnd, PipeEnd] = (PipeEnd(), PipeEnd())

@@ -19,7 +19,7 @@ from pipeprog_bringup.results.cloud_io import write_las, write_ply
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun
 from pipeprog_detect.product.product import Product
-from pipeprog_detect.types import Cylinder, Pipe
+from pipeprog_detect.types import Cylinder, Pipe, PipeEnd
 from pipeprog_msgs import msg
 from pipeprog_node import messages
 
@@ -77,6 +77,7 @@ def product_from_msg(message: msg.PipeArray) -> Product:
         [_pipe(pipe) for pipe in message.pipes],
         [_progress(entry) for entry in message.classes],
         [_run(run) for run in message.runs],
+        message.scale_sigma,
     )
 
 
@@ -92,6 +93,7 @@ def _pipe(message: msg.Pipe) -> Pipe:
         message.rmse,
         message.points,
         message.class_kmeans,
+        (PipeEnd(message.start_sigma, message.start_state), PipeEnd(message.end_sigma, message.end_state)),
     )
 
 

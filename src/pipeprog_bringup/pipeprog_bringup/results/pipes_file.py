@@ -88,6 +88,8 @@ def _scale(value: Any) -> dict[str, Any]:
 def _check_class(entry: dict[str, Any], where: str) -> None:
     for key in ("outer_radius", "planned_m", "installed_m"):
         number(entry, key, where)
+    if entry.get("installed_sigma_m") is not None:
+        number(entry, "installed_sigma_m", where)
     if not isinstance(entry.get("class"), str):
         raise InputError(f"class of {where} is {shown(entry.get('class'))}, not a name")
     name_of(entry["class"], f"the name of {where}")
@@ -101,14 +103,24 @@ def _check_pipe(pipe: dict[str, Any], where: str) -> None:
     for key in ("radius_sigma", "rmse"):
         if pipe.get(key) is not None or key not in pipe:
             number(pipe, key, where)
-    for key in ("class_probability", "visible_arc_deg", "points"):
+    for key in ("class_probability", "visible_arc_deg", "points", "length_sigma"):
         if pipe.get(key) is not None:
             number(pipe, key, where)
     if not isinstance(pipe.get("id"), str):
         raise InputError(f"id of {where} is {shown(pipe.get('id'))}, not a name")
     name_of(pipe["id"], f"the id of {where}")
+    for row in rows_of({"ends": [], **pipe}, "ends", 2):
+        _check_end(row, f"an end of {where}")
     if "class" not in pipe:
         raise InputError(f"'class' is missing in {where}")
     for key in ("class", "class_kmeans"):
         if pipe.get(key) is not None and not isinstance(pipe[key], str):
             raise InputError(f"{key} of {where} is {shown(pipe[key])}, not a name")
+
+
+def _check_end(row: dict[str, Any], where: str) -> None:
+    if not isinstance(row.get("state"), str):
+        raise InputError(f"state of {where} is {shown(row.get('state'))}, not a name")
+    name_of(row["state"], f"the state of {where}")
+    if row.get("sigma") is not None:
+        number(row, "sigma", where)

@@ -68,7 +68,7 @@ def write_pipes(path: Path, product: Product, scale: Scale) -> None:
     """pipes.json, one line a pipe; lengths rounded to the micrometre, far below the error of any measurement."""
     head = {"frame_id": "map", "scale": {"source": scale.source, "sigma": _significant(scale.sigma)}}
     rows = {
-        "pipes": [_pipe_entry(pipe) for pipe in product.pipes],
+        "pipes": [_pipe_entry(pipe, product) for pipe in product.pipes],
         "classes": [
             {
                 "class": entry.name,
@@ -76,6 +76,7 @@ def write_pipes(path: Path, product: Product, scale: Scale) -> None:
                 "planned_m": round(entry.planned, 6),
                 "installed_m": round(entry.installed, 6),
                 "percent": round(entry.percent, 2),
+                "installed_sigma_m": _significant(product.installed_sigma(entry.name)),
             }
             for entry in product.classes
         ],
@@ -92,11 +93,15 @@ def write_progress(path: Path, product: Product) -> None:
     """progress.csv: one line a class, for a spreadsheet."""
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes"])
+        writer.writerow(
+            ["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes", "installed_sigma_m"]
+        )
         for entry in product.classes:
             count = sum(pipe.class_name == entry.name for pipe in product.pipes)
             lengths = [f"{entry.planned:.3f}", f"{entry.installed:.3f}", f"{entry.percent:.1f}"]
-            writer.writerow([for_spreadsheet(entry.name), f"{1e3 * entry.outer_radius:.2f}", *lengths, count])
+            sigma = product.installed_sigma(entry.name)
+            cells = [f"{1e3 * entry.outer_radius:.2f}", *lengths, count, f"{sigma:.4f}" if np.isfinite(sigma) else ""]
+            writer.writerow([for_spreadsheet(entry.name), *cells])
 
 
 def write_trajectory(path: Path, stamps: Sequence[int], translations: FloatArray, quaternions: FloatArray) -> None:
@@ -214,7 +219,7 @@ def read_frame_stamps(path: Path) -> NDArray[np.int64]:
         raise InputError(f"{path} is no frames.csv ({error}): run `pipeprog replay` again") from None
 
 
-def _pipe_entry(pipe: Pipe) -> dict[str, Any]:
+def _pipe_entry(pipe: Pipe, product: Product) -> dict[str, Any]:
     return {
         "id": pipe.id,
         "start": [round(float(value), 6) for value in pipe.cylinder.start],
@@ -229,6 +234,8 @@ def _pipe_entry(pipe: Pipe) -> dict[str, Any]:
         "visible_arc_deg": round(float(np.degrees(pipe.visible_arc)), 1),
         "rmse": _significant(pipe.rmse),
         "points": int(pipe.points),
+        "length_sigma": _significant(product.length_sigma(pipe)),
+        "ends": [{"state": end.state, "sigma": _significant(end.sigma)} for end in pipe.ends],
     }
 
 

@@ -60,6 +60,7 @@ def test_what_is_written_is_valid(content: Any) -> None:
         (lambda pipes: pipes["pipes"][0].update(class_probability=1.2), "$.pipes[0].class_probability"),
         (lambda pipes: pipes["pipes"][0].pop("class_kmeans"), "$.pipes[0]"),
         (lambda pipes: pipes["pipes"][0].update(ambiguous=True), "$.pipes[0].class"),
+        (lambda pipes: pipes["pipes"][0]["ends"][1].update(state="gone"), "$.pipes[0].ends[1].state"),
         (lambda pipes: pipes["classes"][0].update(installed_m="2.0"), "$.classes[0].installed_m"),
         (lambda pipes: pipes["runs"][0]["joints"][0].update(kind="bend"), "$.runs[0].joints[0].kind"),
     ],

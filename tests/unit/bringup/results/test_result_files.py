@@ -20,7 +20,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun
 from pipeprog_detect.product.product import Product
-from pipeprog_detect.types import Cylinder, Pipe
+from pipeprog_detect.types import Cylinder, Pipe, PipeEnd
 
 PIPE = Pipe(
     "p03",
@@ -32,10 +32,11 @@ PIPE = Pipe(
     0.0011,
     20411,
     "DN125",
+    (PipeEnd(0.001, "free"), PipeEnd(0.0008, "wall")),
 )
 SCALE = Scale("board", 0.0004)
 CLASSES = [ClassProgress("DN100", 0.0575, 24.0, 11.3, 100 * 11.3 / 24)]
-PRODUCT = Product([PIPE], CLASSES, [PipeRun("r01", ("p03",), (), 1.42, 1.42)])
+PRODUCT = Product([PIPE], CLASSES, [PipeRun("r01", ("p03",), (), 1.42, 1.42)], 0.0004)
 
 
 def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
@@ -58,10 +59,19 @@ def test_pipes_json_has_the_fields_that_were_agreed(tmp_path: Path) -> None:
                 "visible_arc_deg": 149.0,
                 "rmse": 0.0011,
                 "points": 20411,
+                "length_sigma": 0.001401,
+                "ends": [{"state": "free", "sigma": 0.001}, {"state": "wall", "sigma": 0.0008}],
             }
         ],
         "classes": [
-            {"class": "DN100", "outer_radius": 0.0575, "planned_m": 24.0, "installed_m": 11.3, "percent": 47.08}
+            {
+                "class": "DN100",
+                "outer_radius": 0.0575,
+                "planned_m": 24.0,
+                "installed_m": 11.3,
+                "percent": 47.08,
+                "installed_sigma_m": 0.001401,
+            }
         ],
         "runs": [
             {"id": "r01", "pipes": ["p03"], "barrel_length": 1.42, "centre_line_length": 1.42, "joints": []},
@@ -106,7 +116,9 @@ def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     pipe = Pipe("p01", PIPE.cylinder, float("nan"), None, 0.0, 2.6, 0.001, 3)
     result_files.write_pipes(tmp_path / "pipes.json", Product([pipe], CLASSES, []), Scale("board", None))
     content = json.loads((tmp_path / "pipes.json").read_text())
-    assert content["pipes"][0]["class"] is content["pipes"][0]["radius_sigma"] is content["scale"]["sigma"] is None
+    (row,) = content["pipes"]
+    assert row["class"] is row["radius_sigma"] is row["length_sigma"] is content["scale"]["sigma"] is None
+    assert row["ends"] == 2 * [{"state": "unknown", "sigma": None}]
 
 
 def test_what_two_classes_explain_is_ambiguous(tmp_path: Path) -> None:
@@ -132,7 +144,7 @@ def test_runs_and_their_joints(tmp_path: Path) -> None:
 
 
 def test_progress_csv(tmp_path: Path) -> None:
-    result_files.write_progress(tmp_path / "progress.csv", Product([PIPE, PIPE], CLASSES, []))
+    result_files.write_progress(tmp_path / "progress.csv", Product([PIPE, PIPE], CLASSES, [], 0.0))
     with (tmp_path / "progress.csv").open() as stream:
         row = next(csv.DictReader(stream))
     assert row == {
@@ -142,6 +154,7 @@ def test_progress_csv(tmp_path: Path) -> None:
         "installed_m": "11.300",
         "percent": "47.1",
         "pipes": "2",
+        "installed_sigma_m": "0.0018",
     }
 
 
