@@ -558,7 +558,7 @@ def _folders() -> Iterator[tuple[str, Case]]:
         "a list": b"[1, 2]",
         "a text": b"hello",
         "half": b"rosbag2_bagfile_information:",
-        "sqlite": b"rosbag2_bagfile_information: {storage_identifier: sqlite3, relative_file_paths: [part.mcap]}",
+        "rocksdb": b"rosbag2_bagfile_information: {storage_identifier: rocksdb, relative_file_paths: [part.mcap]}",
         "a storage that is a list": b"rosbag2_bagfile_information: {storage_identifier: [a], relative_file_paths: [b]}",
         "compressed files": b"rosbag2_bagfile_information: {compression_mode: FILE, relative_file_paths: [part.mcap]}",
     }

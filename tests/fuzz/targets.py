@@ -45,7 +45,7 @@ from pipeprog_sfm.boards.board_file import load_board_file
 from tests.fuzz.attempts import Target
 from tests.fuzz.fuzzed_messages import IMAGES, fuzzed_message, good_messages
 from tests.fuzz.mutated_bytes import mutated
-from tests.unit.bringup.recordings import START, camera_messages, info, jpeg, mcap_bytes, raw_image
+from tests.unit.bringup.recordings import START, camera_messages, info, jpeg, mcap_bytes, raw_image, sqlite_bytes
 
 ROOT = Path(__file__).parents[2]
 # What people and adversaries write where a number, a name or a list should stand.
@@ -109,6 +109,7 @@ def targets() -> dict[str, Target]:
     """All of them, by name."""
     files = [
         Target("bag", ".mcap", partial(_damaged, _bags), _read_bag),
+        Target("sqlite", ".db3", partial(_damaged, _databases), _read_bag),
         Target("boq", ".yaml", partial(_spoiled_text, _boqs), load_boq),
         Target("boq_csv", ".csv", partial(_spoiled_text, _bill_tables), load_boq),
         Target("boq_xlsx", ".xlsx", partial(_damaged, _workbooks), load_boq),
@@ -194,6 +195,11 @@ def _workbooks() -> list[bytes]:
                 copy.writestr(name, archive.read(name))
         content.append(again.getvalue())
     return content
+
+
+@cache
+def _databases() -> list[bytes]:
+    return [sqlite_bytes(camera_messages(3)), sqlite_bytes(camera_messages(1))]
 
 
 @cache

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import io
+import sqlite3
+import tempfile
 from pathlib import Path
 
 import cv2
@@ -58,6 +60,30 @@ def mcap_bytes(
         writer.add_message(channels[topic], log_time, data, log_time)
     writer.finish()
     return stream.getvalue()
+
+
+def sqlite_bytes(messages: list[tuple[str, str, int, bytes]]) -> bytes:
+    """A .db3 file of (topic, type, log time, data) messages, as rosbag2's sqlite3 storage writes it on Humble."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "bag.db3")
+        database = sqlite3.connect(path)
+        database.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
+            "serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, "
+            "data BLOB NOT NULL);"
+            "CREATE INDEX timestamp_idx ON messages (timestamp ASC);"
+        )
+        topics: dict[str, int] = {}
+        for topic, type_name, log_time, data in messages:
+            if topic not in topics:
+                topics[topic] = len(topics) + 1
+                database.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr', '')", (topics[topic], topic, type_name))
+            row = (topics[topic], log_time, data)
+            database.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", row)
+        database.commit()
+        database.close()
+        return path.read_bytes()
 
 
 def camera_messages(count: int, prefix: str = "/camera") -> list[tuple[str, str, int, bytes]]:

@@ -14,7 +14,9 @@ from tf2_msgs.msg import TFMessage
 
 from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.recording import cdr
-from pipeprog_bringup.recording.bag import TF, TF_STATIC, Bag, ImageMessage, MotionMessage
+from pipeprog_bringup.recording.bag import Bag, MotionMessage
+from pipeprog_bringup.recording.frame_check import ImageMessage
+from pipeprog_bringup.recording.topic_choice import TF, TF_STATIC
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_SMALL_MESSAGE
 from pipeprog_node import messages, qos

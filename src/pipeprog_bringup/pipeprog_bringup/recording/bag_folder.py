@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mcap files of a recording: one file, or those that the metadata.yaml of a rosbag2 folder names."""
+"""The files of a recording: one file, or those of a rosbag2 folder, as its metadata.yaml or their names order them."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,26 +13,26 @@ from pipeprog_camera.outside_text import shown
 from pipeprog_camera.yaml_file import read_yaml
 
 _LISTED = 5  # names that an error lists
+_STORAGES = ("mcap", "sqlite3", "")  # an empty one is what a crash leaves (rosbag2#2175)
+_NUMBERED = re.compile(r"(.+)_(\d{1,9})\.(mcap|db3)")  # the names that rosbag2 gives the files of one recording
 
 
 def parts(path: Path) -> list[Path]:
-    """The mcap files of the recording `path`, in order; raises InputError where it is none or files are missing."""
+    """The files of the recording `path`, in order; raises InputError where it is none or files are missing."""
     if not path.exists():
         raise InputError(f"no such bag: {path}")
     if path.is_dir():
-        return _named_files(path, _information(path))
+        if (path / "metadata.yaml").is_file():
+            return _named_files(path, _information(path))
+        return _numbered_files(path)
     if not path.is_file():
-        raise InputError(f"{path} is a device or a pipe: give an .mcap file or a rosbag2 folder")
+        raise InputError(f"{path} is a device or a pipe: give an .mcap or .db3 file or a rosbag2 folder")
     return [path]
 
 
 def _information(path: Path) -> dict[str, Any]:
     """What metadata.yaml says of the recording's storage."""
     metadata = path / "metadata.yaml"
-    if not metadata.is_file():
-        inside = sorted(file.name for file in path.glob("*.mcap"))
-        remedy = f"give one of its files ({_listed(inside)}) or run" if inside else "give a rosbag2 folder, or run"
-        raise InputError(f"{path} has no metadata.yaml: {remedy} `ros2 bag reindex {path}`")
     remedy = f"run `ros2 bag reindex {path}`"
     try:
         content = read_yaml(metadata, MAX_METADATA)
@@ -43,12 +44,25 @@ def _information(path: Path) -> dict[str, Any]:
     return information
 
 
+def _numbered_files(path: Path) -> list[Path]:
+    """The files of a folder without metadata.yaml, which rosbag2 writes last: those of one name, by their numbers."""
+    inside = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
+    numbered = {file: match for file in inside if file.is_file() and (match := _NUMBERED.fullmatch(file.name))}
+    if not inside or len(numbered) < len(inside) or len({match[1] for match in numbered.values()}) > 1:
+        names = _listed([file.name for file in inside])
+        remedy = f"give one of its files ({names}) or run" if inside else "give a rosbag2 folder, or run"
+        raise InputError(f"{path} has no metadata.yaml: {remedy} `ros2 bag reindex {path}`")
+    if len(numbered) > MAX_BAG_PARTS:
+        raise InputError(f"{path} holds {len(numbered)} files: {MAX_BAG_PARTS} at most are read; split the recording")
+    return sorted(numbered, key=lambda file: int(numbered[file][2]))
+
+
 def _named_files(path: Path, information: dict[str, Any]) -> list[Path]:
     """The files that the metadata names; all lie in the folder."""
     metadata = path / "metadata.yaml"
     storage = str(information.get("storage_identifier", "mcap"))[:40]
-    if storage != "mcap":
-        raise InputError(f"{path} is stored as {storage}: convert it with `ros2 bag convert` (storage_id: mcap)")
+    if storage not in _STORAGES:
+        raise InputError(f"{path} is stored as {shown(storage)}: convert it with `ros2 bag convert` (storage_id: mcap)")
     if str(information.get("compression_mode", ""))[:40].upper() == "FILE":
         raise InputError(f"{path} is compressed file by file: decompress it with `ros2 bag convert`")
     names = information["relative_file_paths"]

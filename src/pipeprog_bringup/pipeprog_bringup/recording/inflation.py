@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import FREE_CONTENT, FREE_RECORDS, MAX_INFLATION, MIN_BYTES_OF_A_RECORD
+from pipeprog_camera.limits import FREE_CONTENT, FREE_RECORDS, MAX_CHUNK, MAX_INFLATION, MIN_BYTES_OF_A_RECORD
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 COMPRESSIONS = ("", "lz4", "zstd")
@@ -59,6 +59,18 @@ def inflate(data: bytes, compression: str, limit: int) -> bytes:
                 break
     del pieces[limit:]
     return bytes(pieces)
+
+
+def plain_message(data: bytes, allowance: Allowance) -> bytes:
+    """Undo the compression of single messages (rosbag2's message mode); no CDR message starts like zstd."""
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    declared = zstd_size(data)
+    if declared is not None and declared > MAX_CHUNK:
+        return b""
+    plain = inflate(data, "zstd", MAX_CHUNK if declared is None else declared)
+    allowance.take_bytes(len(plain))
+    return plain
 
 
 def zstd_size(data: bytes) -> int | None:

@@ -17,22 +17,14 @@ from typing import BinaryIO
 
 from mcap.opcode import Opcode
 
-from pipeprog_bringup.recording.inflation import ZSTD_MAGIC, Allowance, inflate, zstd_size
-from pipeprog_bringup.recording.mcap_walk import HEAD, MAGIC, MESSAGE_HEAD, Block, Channel, Walk
+from pipeprog_bringup.recording.inflation import ZSTD_MAGIC, Allowance, inflate, plain_message
+from pipeprog_bringup.recording.mcap_walk import HEAD, MAGIC, MESSAGE_HEAD, Block, Walk
+from pipeprog_bringup.recording.message_file import Channel, Message
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import MAX_CHUNK, MAX_DESCRIPTION, MAX_WAITING
+from pipeprog_camera.limits import MAX_DESCRIPTION, MAX_WAITING
 
 _OBJECT = 256  # bytes that a waiting message takes beside its data
 _NOTES = 5  # damaged chunks that are told one by one
-
-
-@dataclass(frozen=True)
-class Message:
-    """One message: log time [ns], channel number in its file, serialised data."""
-
-    log_time: int
-    channel_id: int
-    data: bytes
 
 
 @dataclass
@@ -95,7 +87,7 @@ class McapFile:
             nonlocal held
             log_time, _, _, channel_id, data = heapq.heappop(waiting)
             held -= _OBJECT + len(data)
-            return Message(log_time, channel_id, _plain(data, allowance))
+            return Message(log_time, channel_id, plain_message(data, allowance))
 
         with self.path.open("rb") as stream:
             for block in self._blocks:
@@ -166,23 +158,9 @@ class McapFile:
         return content
 
 
-def _plain(data: bytes, allowance: Allowance) -> bytes:
-    """Undo the compression of single messages (rosbag2's message mode); no CDR message starts like zstd."""
-    if not data.startswith(ZSTD_MAGIC):
-        return data
-    declared = zstd_size(data)
-    if declared is not None and declared > MAX_CHUNK:
-        return b""
-    plain = inflate(data, "zstd", MAX_CHUNK if declared is None else declared)
-    allowance.take_bytes(len(plain))
-    return plain
-
-
 def _other_format(magic: bytes) -> str:
     if magic.startswith(b"#ROSBAG"):
         return " but a ROS 1 bag: convert it with `mcap convert in.bag out.mcap`"
-    if magic.startswith(b"SQLite"):
-        return " but a rosbag2 sqlite3 file: convert it with `ros2 bag convert` (storage_id: mcap)"
     if magic.startswith(ZSTD_MAGIC):
         return " but zstd-compressed as a whole: decompress it with `zstd -d`"
-    return ": give an .mcap file or a rosbag2 folder (videos go through `pipeprog ingest` first)"
+    return ": give an .mcap or .db3 file or a rosbag2 folder (videos go through `pipeprog ingest` first)"

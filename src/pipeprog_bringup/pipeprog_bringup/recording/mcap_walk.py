@@ -23,21 +23,13 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from pipeprog_bringup.recording.inflation import COMPRESSIONS, Allowance
+from pipeprog_bringup.recording.message_file import Channel
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CHANNELS, MAX_CHUNK, MAX_DESCRIPTION, MAX_NAME
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = 9  # bytes before a record's content: opcode, length
 MESSAGE_HEAD = 22  # bytes before a message's data: channel, sequence, log time, publish time
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic of the file: its message type and how its messages are encoded."""
-
-    topic: str
-    type_name: str
-    encoding: str
 
 
 @dataclass(slots=True)

@@ -172,6 +172,49 @@ def test_prefers_the_compressed_image_and_ignores_depth(tmp_path: Path) -> None:
     assert (raw.image_type, raw.camera_info_topic, raw.image_count) == (cdr.IMAGE, "/camera/camera_info", 1)
 
 
+def spot_messages(camera: str, frame_id: str) -> list[tuple[str, str, int, bytes]]:
+    """One camera as Spot's driver names its topics."""
+    topics = {"image": f"/spot/camera/{camera}/compressed", "info": f"/spot/camera/{camera}/camera_info"}
+    return [
+        (topics["info"], cdr.CAMERA_INFO, START, info(0, frame_id=frame_id)),
+        (topics["image"], cdr.COMPRESSED_IMAGE, START, image(0, frame_id)),
+    ]
+
+
+def test_each_camera_of_spot_has_its_own_calibration(tmp_path: Path) -> None:
+    messages = spot_messages("frontleft", "frontleft") + spot_messages("right", "right")
+    path = write_bag(tmp_path / "spot.mcap", messages)
+    for camera in ("frontleft", "right"):
+        bag = Bag.open(path, image_topic=f"/spot/camera/{camera}/compressed")
+        assert bag.camera_info_topic == f"/spot/camera/{camera}/camera_info"
+        assert Bag.open(path, camera_info_topic=bag.camera_info_topic).image_topic == bag.image_topic
+    with pytest.raises(InputError) as caught:
+        Bag.open(path)
+    assert "frontleft/compressed --camera-info-topic /spot/camera/frontleft/camera_info" in str(caught.value)
+    assert "frontleft/compressed --camera-info-topic /spot/camera/right/camera_info" not in str(caught.value)
+
+
+def test_where_the_names_do_not_tell_the_frame_does(tmp_path: Path) -> None:
+    messages = [
+        ("/pictures", cdr.COMPRESSED_IMAGE, START, image(0, "left")),
+        ("/a/camera_info", cdr.CAMERA_INFO, START, info(0, frame_id="right")),
+        ("/b/camera_info", cdr.CAMERA_INFO, START, info(0, frame_id="left")),
+    ]
+    assert Bag.open(write_bag(tmp_path / "odd.mcap", messages)).camera_info_topic == "/b/camera_info"
+
+
+def test_a_folder_without_metadata_is_read_in_the_order_of_its_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "crashed"
+    path.mkdir()
+    messages = camera_messages(11)
+    for number in range(11):
+        (path / f"walk_{number}.mcap").write_bytes(mcap_bytes(messages[2 * number : 2 * number + 2]))
+    assert [frame.data for frame in Bag.open(path)] == [data for _, kind, _, data in messages[1::2]]
+    (path / "other_0.mcap").write_bytes(mcap_bytes(messages))
+    with pytest.raises(InputError, match=r"no metadata.yaml: give one of its files \(other_0.mcap"):
+        Bag.open(path)
+
+
 def test_two_cameras_are_listed_as_flags(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "two.mcap", camera_messages(2, "/left") + camera_messages(2, "/right"))
     with pytest.raises(InputError) as caught:
@@ -219,7 +262,7 @@ def test_recordings_that_hold_nothing_to_use_are_errors(tmp_path: Path) -> None:
         "is not an mcap file": tmp_path / "text.mcap",
         "ROS 1": tmp_path / "ros1.bag",
         "no metadata.yaml": tmp_path / "folder",
-        "stored as sqlite3": folder(tmp_path / "sqlite", [b""], storage_identifier="sqlite3"),
+        "stored as 'rocksdb'": folder(tmp_path / "rocks", [b""], storage_identifier="rocksdb"),
         "no rosbag2 metadata": folder(tmp_path / "odd", [b""]),
         "is missing": folder(tmp_path / "gap", [b""], relative_file_paths=["gone.mcap"]),
         "none of the 2 images": write_bag(
