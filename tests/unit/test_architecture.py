@@ -59,6 +59,7 @@ FOLDERS = {
         "recording": set(),
         "clouds": set(),
         "results": {"clouds"},
+        "export": {"recording", "results"},
         "report": {"recording", "results"},
         "view": {"report", "results"},
         "playback": {"recording", "results"},
@@ -93,6 +94,7 @@ DEPENDENCIES = {
     "pye57": None,
     "pycolmap": None,
     "lzf": None,
+    "xlsxwriter": None,
     "zstandard": None,
 }
 

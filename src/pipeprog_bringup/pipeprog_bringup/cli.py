@@ -233,6 +233,22 @@ def view(
         display.show(folder)
 
 
+@app.command(rich_help_panel="From results")
+def export(
+    folder: Annotated[Path, typer.Argument(help="Results of a survey.", metavar="DIR")],
+    to: Annotated[list[str], typer.Option("--to", help="Format; may be repeated: xlsx, csv.", metavar="FORMAT")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the files; without, DIR/export.", metavar="FOLDER")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files of an earlier export.")] = False,
+) -> None:
+    """Write the results for other programs: `pipeprog export out/demo --to xlsx --to csv`."""
+    from pipeprog_bringup.export.formats import export as write
+
+    for path in write(folder, to, out or folder / "export", force):
+        _say(f"Written: {path}")
+
+
 def main() -> None:
     """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
     from pipeprog_bringup.playback.node_processes import NodeFailure

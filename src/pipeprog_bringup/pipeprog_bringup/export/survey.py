@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is exported: a results folder in the coordinates that the user wants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pipeprog_bringup.results.results_reader import Results, read_results
+from pipeprog_detect.types import Cylinder
+
+
+@dataclass(frozen=True)
+class SurveyPipe:
+    """A pipe to export: its row of pipes.json, its place [m], the id of its run (empty without one)."""
+
+    row: dict[str, Any]
+    cylinder: Cylinder
+    run: str
+
+    @property
+    def id(self) -> str:
+        """`p01`, `p02`, ..."""
+        return str(self.row["id"])
+
+    @property
+    def class_name(self) -> str:
+        """Name of the planned class, empty where it has none."""
+        return str(self.row["class"] or "")
+
+
+@dataclass(frozen=True)
+class BillLineRow:
+    """A line of the bill as config.yaml keeps it; texts are empty where they are not given."""
+
+    class_name: str
+    name: str
+    planned: float
+    system: str
+    zone: str
+    activity: str
+    start: str
+    finish: str
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The results of a run."""
+
+    results: Results
+
+    @cached_property
+    def pipes(self) -> list[SurveyPipe]:
+        """The pipes, in the order of pipes.json."""
+        run_of = {pipe: str(run.get("id", "")) for run in self.results.runs for pipe in _texts(run.get("pipes"))}
+        return [
+            SurveyPipe(row, cylinder, run_of.get(row["id"], ""))
+            for row, cylinder in zip(self.results.pipes, self.results.cylinders, strict=True)
+        ]
+
+    @cached_property
+    def lines(self) -> list[BillLineRow]:
+        """The lines of the bill; of a class that config.yaml tells no lines of, the class itself."""
+        told = {}
+        entries = self.results.config.get("boq")
+        for entry in entries if isinstance(entries, list) else []:
+            if isinstance(entry, dict) and isinstance(entry.get("lines"), list):
+                told[str(entry.get("name"))] = [line for line in entry["lines"] if isinstance(line, dict)]
+        rows = []
+        for row in self.results.classes:
+            name = str(row["class"])
+            for line in told.get(name) or [{"name": name, "planned_length_m": row["planned_m"]}]:
+                rows.append(_line(name, line))
+        return rows
+
+    @property
+    def finished(self) -> str:
+        """When the run ended, ISO 8601 in UTC; empty where run.json does not tell."""
+        return str(self.results.facts.get("finished", ""))
+
+    @property
+    def recording(self) -> str:
+        """Name of the recording or cloud, empty where run.json does not tell."""
+        return Path(str(self.results.facts.get("bag", self.results.facts.get("cloud", "")))).name
+
+
+def read_survey(folder: Path) -> Survey:
+    """The survey in a results folder; raises InputError where it holds none."""
+    return Survey(read_results(folder))
+
+
+def _line(class_name: str, line: dict[str, Any]) -> BillLineRow:
+    planned = line.get("planned_length_m")
+    texts = (str(line.get(key, "")) for key in ("system", "zone", "activity", "start", "finish"))
+    length = float(planned) if isinstance(planned, int | float) else 0.0
+    return BillLineRow(class_name, str(line.get("name", class_name)), length, *texts)
+
+
+def _texts(value: Any) -> list[str]:
+    return [text for text in value if isinstance(text, str)] if isinstance(value, list) else []
