@@ -24,6 +24,8 @@ KNOWN_RADIUS, KNOWN_AXIS = 0.02, 0.5
 # Search range of any other pipe: in standard deviations of the given radius (three of the axis; two and a half of the
 # radius, which is known better), at least in pixels, and at most in radii, so that it stays one pipe.
 AXIS_RANGE, RADIUS_RANGE = (3.0, 2.0, 0.4), (2.5, 2.0, 0.3)
+# Standard deviation [m] of a radius that is fixed: less than a contour tells (0.1 mm).
+RADIUS_FIXED = 1e-5
 # The distance from the cameras is sought within two of its standard deviations.
 DEPTH_RANGE = 2.0
 # Up to three results of the search compete on sub-pixel edges, if their contours differ by this much [px rms].
@@ -38,6 +40,7 @@ class Start:
         cylinder: where its contour is sought.
         radius_sigma: standard deviation of its radius [m]; that of its axis is taken as twice as large.
         radius_known: contours of other radii are not sought; a piece that is not extended keeps this one.
+        radius_fixed: a known radius that the pipe's own edges do not change either.
         depth_sigma: standard deviation of its distance from the cameras [m], where that is larger.
         slope_sigma: standard deviation of its slope towards the cameras [rad].
         ends_known: the cloud shows its surface between the ends.
@@ -51,6 +54,7 @@ class Start:
     slope_sigma: float = np.inf
     ends_known: bool = False
     seen: SeenArc | None = None
+    radius_fixed: bool = False
 
     def precision(self) -> FloatArray:
         """(5, 5) precision [1/m^2] of the step of `Scene.moved`; the radius is left to the contour."""
@@ -90,9 +94,9 @@ def refine(
     steps, prior = first
     scene = replace(scene, blur=scene.moved(steps[0]).measured_blur())
     held = prior.copy()
-    held[4, 4] = 1.0 / RADIUS_HELD**2
+    held[4, 4] = 1.0 / (RADIUS_FIXED if start.radius_fixed else RADIUS_HELD) ** 2
     priors = [held] if start.radius_known else [prior]
-    if start.radius_known and follow:
+    if start.radius_known and follow and not start.radius_fixed:
         priors.append(prior)  # the pipe's own edges, once found, tell the radius
     step = best_of(scene, steps, priors[0])
     found: AdjustedCylinder | None = None
@@ -102,7 +106,7 @@ def refine(
             return None
         step = step + found.step
     if found is not None and follow:
-        found = followed(found, prior, held)
+        found = followed(found, priors[-1], held)
     if found is None or found.share < MIN_SUPPORT:
         return None
     surface = start.cylinder if start.ends_known else None

@@ -19,20 +19,27 @@ from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.depth_from_cloud import at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.thin.pair_views import pair_views
+from pipeprog_detect.thin.parallel_axes import (
+    LEAST_PARALLEL,
+    NEARLY_PARALLEL,
+    PARALLEL_SIGMA,
+    Proposal,
+    parallel_directions,
+    propose_parallel,
+)
 from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.candidate_fit import CONVINCING
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 
 # Proposals that are measured, and points of the cloud that bound their depths: a computing budget. More proposals than
 # a site has thin pipes cost time only.
 MOST_PROPOSED, MOST_POINTS = 40, 600_000
 # Without support by the cloud, this support of the contour is required, and half of it on each side separately: the
-# edge of a duct, whose faces differ in brightness, is one side, with texture for the other.
-LINES_CONVINCING = 0.6
+# edge of a duct, whose faces differ in brightness, is one side, with texture for the other. What runs parallel to known
+# pipes, with the lines of four views along it, has evidence beside its contour, as a candidate of the cloud has.
+LINES_CONVINCING, PARALLEL_CONVINCING = 0.6, CONVINCING
 # Standard deviation of the distance of a pipe found by its lines [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
-# Pipes are installed parallel, to a standard deviation of 0.3 deg: at least three within 5 deg of one direction tell it
-# (two may be so by chance).
-NEARLY_PARALLEL, PARALLEL_SIGMA, LEAST_PARALLEL = np.radians(5.0), np.radians(0.3), 3
 # The axes of pipes side by side are at least two radii apart.
 TOUCHING = 2.0
 # Flatness is 0 for a cylinder and 1 for a strip: one that exceeds the middle by two standard deviations is a strip.
@@ -67,17 +74,21 @@ def find_thin_pipes(
     some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
     thin: list[MeasuredPipe] = []
-    seen = pair_views(views, some, radii, known, edges)
-    for proposed in propose(seen, some, radii, MOST_PROPOSED):
-        if is_known(proposed, known) or _is_rival(proposed, thin, views):
-            continue
-        fit = lines.measure(proposed, known, follow=False)
-        if fit is not None:
-            fit = lines.follow(fit, proposed.radius, known)
+
+    def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known):
-            continue
+            return
         thin.append(MeasuredPipe(_as_candidate(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
         known.append(fit.cylinder)
+
+    seen = pair_views(views, some, radii, known, edges)
+    for parallel in propose_parallel(seen, parallel_directions(known), radii):
+        if not is_known(parallel.cylinder, known) and not _is_rival(parallel.cylinder, thin, views):
+            consider(lines.along_known_pipes(parallel, known))
+    for proposed in propose(seen, some, radii, MOST_PROPOSED):
+        if not is_known(proposed, known) and not _is_rival(proposed, thin, views):
+            fit = lines.measure(proposed, known, follow=False)
+            consider(None if fit is None else lines.follow(fit, proposed.radius, known))
     return thin
 
 
@@ -95,6 +106,32 @@ class _LineFitter:
     points: NDArray[np.float32]
     radii: Sequence[float]
     boq: BillOfQuantities
+
+    def along_known_pipes(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
+        """The whole of a pipe of which the direction is known; None where its contour is not seen.
+
+        Views from one height leave its depth open: then it is sought from where the cloud has it, too, and the best
+        supported fit counts.
+        """
+        starts = [(proposal.cylinder, min(proposal.depth_sigma, LINE_DEPTH_SIGMA))]
+        if proposal.depth_sigma > DEPTH_SIGMA * proposal.cylinder.radius:
+            centre = mean_centre(proposal.cylinder, self.views)
+            at_depth = None if centre is None else at_cloud_depth(proposal.cylinder, self.points, centre, False)
+            starts += [] if at_depth is None else [(at_depth, DEPTH_SIGMA * at_depth.radius)]
+        fits = [self._parallel(*start, known) for start in starts]
+        return max((fit for fit in fits if fit is not None), key=lambda fit: fit.support, default=None)
+
+    def _parallel(self, start: Cylinder, depth_sigma: float, known: Sequence[Cylinder]) -> ContourFit | None:
+        """The accepted fit of a pipe that is parallel to known ones.
+
+        A shadow along it is taken for one of its sides where no planned radius results: then its own one is held.
+        """
+        for fixed in (False, True):
+            begin = Start(start, start.radius, True, depth_sigma, PARALLEL_SIGMA, radius_fixed=fixed)
+            fit = refine(begin, self.views, known, self.radii)
+            if fit is None or self._accepts(fit, known, PARALLEL_CONVINCING):
+                return fit
+        return None
 
     def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
         """The whole of a pipe of the given radius [m] of which a piece was found.
@@ -119,13 +156,16 @@ class _LineFitter:
         """The fit where it has the contour of a pipe and a planned radius; None otherwise."""
         start = Start(proposed, proposed.radius, True, depth_sigma, slope_sigma)
         fit = refine(start, self.views, known, self.radii, follow)
-        if fit is None or fit.support < LINES_CONVINCING:
-            return None
-        if not is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq):
-            return None
-        if Scene.of(fit.cylinder, self.views, known).support().weaker_share < 0.5 * LINES_CONVINCING:
-            return None
-        return None if fit.flatness - FLAT > SURELY * fit.flatness_sigma else fit
+        return fit if fit is not None and self._accepts(fit, known, LINES_CONVINCING) else None
+
+    def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], convincing: float) -> bool:
+        """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does."""
+        return (
+            fit.support >= convincing
+            and is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
+            and Scene.of(fit.cylinder, self.views, known).support().weaker_share >= 0.5 * convincing
+            and fit.flatness - FLAT <= SURELY * fit.flatness_sigma
+        )
 
 
 def aligned(
