@@ -40,7 +40,8 @@ from pipeprog_detect.cloud import axis_voting, local_shape, octree, plane_segmen
 from pipeprog_detect.cloud.cylinder_fit import basis, fit_cylinder
 from pipeprog_detect.cloud.ellipse_search import find_ellipses
 from pipeprog_detect.silhouette.apparent_contour import contour_samples, project
-from pipeprog_detect.silhouette.limb_edges import LINEAR_LIGHT, limb_basis
+from pipeprog_detect.silhouette.light_sampling import LINEAR_LIGHT
+from pipeprog_detect.silhouette.limb_edges import limb_basis
 from pipeprog_detect.thin.line_segments import segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_sfm.boards.board_detection import detect_boards

@@ -40,6 +40,13 @@ class View:
         rotation = self.camera_from_map[:3, :3]
         return -rotation.T @ self.camera_from_map[:3, 3]
 
+    @cached_property
+    def geometry(self) -> FloatArray:
+        """camera_from_map by rows (12), fx, fy, cx, cy, width, height and the projection centre (21,)."""
+        camera = self.camera
+        lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+        return np.concatenate([self.camera_from_map[:3].ravel(), lens, self.centre])
+
 
 @dataclass(frozen=True)
 class Cylinder:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,8 +55,8 @@ class ContourSamples:
         return ContourSamples(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
     def thinned(self, limit: int) -> ContourSamples:
-        """About `limit` of them (fewer than twice as many), evenly spread."""
-        return self.select(np.arange(0, len(self), max(len(self) // limit, 1)))
+        """At most `limit` of them and at least half as many, evenly spread; all where there are fewer."""
+        return self.select(np.arange(0, len(self), max(-(-len(self) // limit), 1)))
 
     def sideways(self) -> FloatArray:
         """Sign (N,) of the outward displacement that a shift of the whole pipe towards side 0 causes."""
@@ -70,6 +71,14 @@ class ContourSamples:
         """The distinct positions (B,) along the axis [m], and the index (N,) of each sample's own among them."""
         along, index = np.unique(np.round(self.along, POSITION_DIGITS), return_inverse=True)
         return along, index.astype(np.int64)
+
+
+def parts_by_view(samples: ContourSamples, views: int) -> Iterator[tuple[int, slice]]:
+    """The views that show some of the samples, each with these; samples come view by view."""
+    bounds = np.searchsorted(samples.view, np.arange(views + 1)).tolist()
+    for index, (first, last) in enumerate(itertools.pairwise(bounds)):
+        if last > first:
+            yield index, slice(first, last)
 
 
 def project(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -91,9 +100,41 @@ def in_image(view: View, points: FloatArray) -> NDArray[np.bool_]:
     return np.asarray((depth > NEAR_PLANE) & (pixel > 0).all(axis=1) & (pixel < size - 1).all(axis=1))
 
 
+@dataclass(frozen=True)
+class ViewArrays:
+    """What `View.geometry` tells of V views: poses (V, 3, 4), lenses (V, 4), sizes (V, 2) and centres (V, 3)."""
+
+    poses: FloatArray
+    lenses: FloatArray
+    sizes: FloatArray
+    centres: FloatArray
+
+    @classmethod
+    def of(cls, views: Sequence[View]) -> ViewArrays:
+        """Those of the views, in their order."""
+        rows = np.concatenate([view.geometry for view in views]).reshape(len(views), -1)
+        poses = np.ascontiguousarray(rows[:, :12]).reshape(-1, 3, 4)
+        return cls(poses, rows[:, 12:16], rows[:, 16:18], rows[:, 18:21])
+
+    def pixels_per_metre(self, point: FloatArray) -> FloatArray:
+        """Width (V,) in the images [px] of one metre across the line of sight at a point (3,) of the map."""
+        distance = np.sqrt(((self.centres - point) ** 2).sum(axis=1))
+        return np.asarray(self.lenses[:, 0] / np.maximum(distance, 1e-3), np.float64)
+
+    def showing(self, points: FloatArray) -> NDArray[np.bool_]:
+        """Mask (V,) of the views in which some of the points (N, 3) of the map lie."""
+        in_camera = np.einsum("vik,nk->ivn", self.poses[:, :, :3], points) + self.poses[:, :, 3].T[:, :, None]
+        depth = np.maximum(in_camera[2], NEAR_PLANE)
+        inside = in_camera[2] > NEAR_PLANE
+        for k in (0, 1):
+            pixel = self.lenses[:, k, None] * in_camera[k] / depth + self.lenses[:, k + 2, None]
+            inside &= (pixel > 0) & (pixel < self.sizes[:, k, None] - 1)
+        return np.asarray(inside.any(axis=1), bool)
+
+
 def views_showing(points: FloatArray, views: Sequence[View], most: int) -> list[View]:
     """The views that show some of the points (N, 3) of the map, evenly thinned to `most` at the most."""
-    able = [view for view in views if in_image(view, points).any()]
+    able = [views[index] for index in np.flatnonzero(ViewArrays.of(views).showing(points))] if views else []
     return able[:: -(-len(able) // most)] if able else []
 
 
@@ -105,17 +146,22 @@ def contour_samples(
     The positions along the axis are common to all views, so that evidence can be pooled by position. `basis` (2, 3):
     the directions across the axis of which the Jacobian is taken.
     """
-    gains = [view.camera.fx / max(float(np.linalg.norm(view.centre - cylinder.middle)), 1e-3) for view in views]
-    step = spacing / float(np.median(gains))
+    arrays = ViewArrays.of(views)
+    step = spacing / float(np.median(arrays.pixels_per_metre(cylinder.middle)))
     count = max(int(cylinder.length / step), 4)
     fractions = (np.arange(count) + 0.5) / count
-    poses = np.stack([view.camera_from_map[:3] for view in views])
-    lenses = np.array([[view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy] for view in views])
-    sizes = np.array([[view.camera.width, view.camera.height] for view in views], float)
-    centres = np.stack([view.centre for view in views])
     line = np.stack([cylinder.start, cylinder.axis])
     view, side, position, columns = _contour_lines(
-        line, cylinder.length, cylinder.radius, poses, lenses, sizes, centres, basis, fractions, margin
+        line,
+        cylinder.length,
+        cylinder.radius,
+        arrays.poses,
+        arrays.lenses,
+        arrays.sizes,
+        arrays.centres,
+        basis,
+        fractions,
+        margin,
     )
     share, gain = fractions[position], columns[:, 4]
     jacobian = np.empty((len(view), 5))

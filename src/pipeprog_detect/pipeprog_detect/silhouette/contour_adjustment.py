@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
@@ -103,7 +104,7 @@ def _pass(
         prior: precision (5, 5) of the start [1/m^2].
         so_far: (5,) from that start to the cylinder after the step.
         reach: distance of edges from the contour [px].
-        limit: about how many samples are used; all if None.
+        limit: how many samples are used at the most; all if None.
 
     Returns:
         The samples, their edges and the solution; None where too few are visible or no cylinder is left.
@@ -170,40 +171,106 @@ def _solve(samples: ContourSamples, edges: LimbEdges, views: int, prior: FloatAr
     The covariance clusters the residuals by view and by position (sandwich estimator): edges along one line share the
     error of its pose, edges at one position that of its texture.
     """
-    jacobian = samples.jacobian
-    sign = samples.sideways()
-    unknowns = jacobian.shape[1]
-    step: FloatArray = np.zeros(unknowns)
-    offset = np.zeros(views)
-    variance = FIRST_OFFSET**2
-    rows = np.arange(len(samples))
-    for _ in range(ROUNDS):
-        predicted = jacobian @ step + sign * offset[samples.view]
-        distance = np.where(np.isfinite(edges.offset), np.abs(edges.offset - predicted[:, None]), np.inf)
-        nearest = np.argmin(distance, axis=1)
-        used = np.isfinite(distance[rows, nearest]) & (edges.sigma[rows, nearest] < WORST_EDGE)
-        seen = np.where(used, edges.offset[rows, nearest], 0.0)
-        sigma = np.where(used, edges.sigma[rows, nearest], 1.0)
-        residual = np.where(used, seen - predicted, 0.0)
-        weight = used / (sigma**2 + FLOOR**2) / (1.0 + (residual / ROBUST) ** 2)
-        weighted = jacobian * weight[:, None]
-        own = np.bincount(samples.view, weight, views) + 1.0 / variance
-        cross = np.stack([np.bincount(samples.view, sign * weighted[:, k], views) for k in range(unknowns)], axis=1)
-        right = np.bincount(samples.view, sign * weight * seen, views)
-        normal = weighted.T @ jacobian - (cross / own[:, None]).T @ cross + prior
-        normal += np.diag(np.full(unknowns, 1e-9 * np.trace(normal)))
-        step = np.linalg.solve(normal, weighted.T @ seen - cross.T @ (right / own) - prior @ so_far)
-        offset = (right - cross @ step) / own
-        active = own > 2.0 / variance
-        if active.any():
-            variance = max(float(np.mean(offset[active] ** 2 + 1.0 / own[active])), LEAST_OFFSET**2)
-    remaining = np.where(used, seen - jacobian @ step - sign * offset[samples.view], 0.0)
+    jacobian, sign = samples.jacobian, samples.sideways()
+    step, offset, normal, rows = _rounds(
+        jacobian, sign, samples.view, (edges.offset, edges.sigma), views, (prior, prior @ so_far)
+    )
+    used, weight, remaining, own = rows[:, 0] > 0.0, rows[:, 1], rows[:, 2], rows[:, 3]
+    weighted = jacobian * weight[:, None]
+    cross = np.stack([np.bincount(samples.view, sign * column, views) for column in weighted.T], axis=1)
     inverse = np.linalg.inv(normal)
-    freed = weighted - (weight * sign)[:, None] * (cross / own[:, None])[samples.view]
+    freed = weighted - (weight * sign / own)[:, None] * cross[samples.view]
     spread = _clustered(weighted * remaining[:, None], samples.view, used)
     spread = spread + _clustered(freed * remaining[:, None], samples.positions()[1], used)
     displacement = jacobian @ step + sign * offset[samples.view]
     return _Solution(step, inverse @ spread @ inverse + inverse, offset, displacement, used)
+
+
+@njit(cache=True, nogil=True)
+def _rounds(
+    jacobian: FloatArray,
+    sign: FloatArray,
+    view: IntArray,
+    edges: tuple[FloatArray, FloatArray],
+    views: int,
+    start: tuple[FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The rounds of the robust weights: step (K,), offsets (V,) and the last round's normal equations (K, K).
+
+    And (N, 4) of each sample: 1 where an edge counted, else 0; its weight; what step and offset leave of its distance
+    [px]; and the weight of its view's offset. `edges`: offset and sigma (N, M) [px]; `start`: the precision (K, K) of
+    the start, and its right-hand side (K,).
+    """
+    count, unknowns = jacobian.shape
+    place, sigma = edges
+    prior, pull = start
+    step: FloatArray = np.zeros(unknowns)
+    offset = np.zeros(views)
+    normal = np.empty((unknowns, unknowns))
+    own, right, cross = np.empty(views), np.empty(views), np.empty((views, unknowns))
+    chosen = np.empty(count, np.int64)
+    rows = np.zeros((count, 4))
+    variance = FIRST_OFFSET**2
+    for _ in range(ROUNDS):
+        own[:], right[:], cross[:] = 1.0 / variance, 0.0, 0.0
+        normal[:] = prior
+        along = -pull
+        for i in range(count):
+            predicted = sign[i] * offset[view[i]]
+            for k in range(unknowns):
+                predicted += jacobian[i, k] * step[k]
+            best, least = -1, np.inf
+            for m in range(place.shape[1]):
+                distance = abs(place[i, m] - predicted)
+                if distance < least:
+                    best, least = m, distance
+            chosen[i] = best if best >= 0 and sigma[i, best] < WORST_EDGE else -1
+            if chosen[i] < 0:
+                rows[i, 1] = 0.0
+                continue
+            seen = place[i, best]
+            weight = 1.0 / (sigma[i, best] ** 2 + FLOOR**2) / (1.0 + ((seen - predicted) / ROBUST) ** 2)
+            rows[i, 1] = weight
+            own[view[i]] += weight
+            right[view[i]] += sign[i] * weight * seen
+            for k in range(unknowns):
+                part = weight * jacobian[i, k]
+                cross[view[i], k] += sign[i] * part
+                along[k] += part * seen
+                for other in range(k + 1):
+                    normal[k, other] += part * jacobian[i, other]
+        for v in range(views):
+            for k in range(unknowns):
+                share = cross[v, k] / own[v]
+                along[k] -= share * right[v]
+                for other in range(k + 1):
+                    normal[k, other] -= share * cross[v, other]
+        trace = 0.0
+        for k in range(unknowns):
+            trace += normal[k, k]
+            for other in range(k):
+                normal[other, k] = normal[k, other]
+        for k in range(unknowns):
+            normal[k, k] += 1e-9 * trace
+        step[:] = np.linalg.solve(normal, along)
+        total, active = 0.0, 0
+        for v in range(views):
+            offset[v] = right[v]
+            for k in range(unknowns):
+                offset[v] -= cross[v, k] * step[k]
+            offset[v] /= own[v]
+            if own[v] > 2.0 / variance:
+                total += offset[v] ** 2 + 1.0 / own[v]
+                active += 1
+        if active:
+            variance = max(total / active, LEAST_OFFSET**2)
+    for i in range(count):
+        rows[i, 3] = own[view[i]]
+        if chosen[i] >= 0:
+            rows[i, 0], rows[i, 2] = 1.0, place[i, chosen[i]] - sign[i] * offset[view[i]]
+            for k in range(unknowns):
+                rows[i, 2] -= jacobian[i, k] * step[k]
+    return step, offset, normal, rows
 
 
 def _clustered(scores: FloatArray, group: IntArray, used: NDArray[np.bool_]) -> FloatArray:

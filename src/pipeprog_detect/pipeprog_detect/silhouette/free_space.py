@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import in_image, project
+from pipeprog_detect.silhouette.apparent_contour import ViewArrays, in_image, project
 from pipeprog_detect.silhouette.occlusion import BEFORE, cylinder_rows, hidden_by_cylinders
 from pipeprog_detect.types import Cylinder, View
 
@@ -37,7 +37,8 @@ def free_stretches(cylinder: Cylinder, views: Sequence[View], others: Sequence[C
     points = cylinder.start + along[:, None] * cylinder.axis
     rows = cylinder_rows(others)
     behind, before = np.zeros(count), np.zeros(count)
-    for view in views:
+    for index in np.flatnonzero(ViewArrays.of(views).showing(points)) if views else ():
+        view = views[index]
         through, opaque = _looked_through(points, cylinder.radius, view, rows)
         behind += through
         before += opaque

@@ -76,24 +76,33 @@ def _smeared(
     return np.where(window, result - mean[:, None], np.float32(0.0)).astype(np.float32)
 
 
-@njit(cache=True)
 def _scores(
     steps: FloatArray, jacobian: FloatArray, response: NDArray[np.float32], first: float, step: float
 ) -> FloatArray:
-    """Sum over samples of the response at the displacement that each step (M, 5) causes there."""
+    """Sum over samples of the response (N, Q) at the displacement that each step (M, 5) causes there (M,)."""
+    places = np.vstack([steps.T / step, np.full(len(steps), -first / step)])
+    moves = np.hstack([jacobian, np.ones((len(jacobian), 1))])
+    return _summed(places.T.astype(np.float32), np.ascontiguousarray(moves.T, np.float32), response)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _summed(steps: NDArray[np.float32], moves: NDArray[np.float32], response: NDArray[np.float32]) -> FloatArray:
+    """Sum (M,) over samples of the response (N, Q) at the place `steps` (M, 6) @ `moves` (6, N); 0 beside it."""
     result = np.zeros(len(steps))
-    last = response.shape[1] - 1
+    count, width = response.shape
+    place = np.empty(count, np.float32)
+    flat = response.ravel()
     for m in range(len(steps)):
-        total = 0.0
-        for n in range(len(jacobian)):
-            offset = 0.0
-            for k in range(5):
-                offset += steps[m, k] * jacobian[n, k]
-            place = (offset - first) / step
-            if place >= 0.0 and place < last:
-                below = int(place)
-                part = place - below
-                total += response[n, below] * (1.0 - part) + response[n, below + 1] * part
+        s0, s1, s2, s3, s4, s5 = steps[m]
+        for n in range(count):
+            place[n] = s0 * moves[0, n] + s1 * moves[1, n] + s2 * moves[2, n] + s3 * moves[3, n] + s4 * moves[4, n] + s5
+        total = np.float32(0.0)
+        for n in range(count):
+            if place[n] >= 0.0 and place[n] < width - 1:
+                below = int(place[n])
+                part = place[n] - np.float32(below)
+                left = flat[n * width + below]
+                total += left + part * (flat[n * width + below + 1] - left)
         result[m] = total
     return result
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.arrays import FloatArray, IntArray
 
 # Half of the width of the limb model's window inside the pipe [px]: shading stays smooth so far.
 INWARD = 8.0
@@ -18,21 +19,11 @@ WINDOW_OF_HALF_WIDTH = 0.8
 # Step of the trial positions [px] (the minimum is refined by a parabola), and edges of one profile that are kept: limb,
 # highlight and shadow.
 TRIAL_STEP, MOST_EDGES = 0.1, 3
-# Profiles that are compared with the model at a time: an array of 2 MB.
-_BLOCK = 1024
+# Widths are grouped by 15 %, which moves the limb's shape by less than the noise.
+WIDTH_STEP = float(np.log(1.15))
 # Share of Schlick's reflectance that a painted or a rough metal surface keeps at grazing incidence: between none (matt)
 # and a half (gloss); the tests hold that either moves the edge by less than 0.09 px.
 RIM = 0.25
-
-
-def _linear_light() -> NDArray[np.float32]:
-    """Table from the 256 grey levels of an sRGB image to light, scaled to 0 ... 255 (IEC 61966-2-1)."""
-    level = np.arange(256) / 255.0
-    return (255.0 * np.where(level < 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)).astype(np.float32)
-
-
-# Lens and pixel blur light, not grey levels: in grey levels a bright pipe before a dark wall looks 0.2 px too wide.
-LINEAR_LIGHT = _linear_light()
 
 
 @dataclass(frozen=True)
@@ -101,74 +92,166 @@ def _is_thin(half_width: float) -> bool:
     return half_width * WINDOW_OF_HALF_WIDTH < INWARD
 
 
-def limb_cost(
-    values: FloatArray, offsets: FloatArray, half_width: FloatArray, blur: float, trials: FloatArray
-) -> FloatArray:
-    """What `limb_basis` at each trial position leaves of the values' squares (N, T).
+@dataclass(frozen=True)
+class _Models:
+    """Orthonormal models of profiles of Q offsets, for T trial positions of a limb, for each group of widths.
 
-    The model's levels follow by linear least squares (variable projection). Widths are grouped by 15 %, which moves the
-    limb's shape by less than the noise.
+    Attributes:
+        limbs: (G, Q, 6 * T) float32: column k * T + t is the k-th of the model at trial t (`limb_basis`); 0 if none.
+        smooth: (Q, 5 or 6) float32: a polynomial with as many coefficients as the limb model of the median width.
+        group: (N,) of each profile.
     """
-    cost = np.empty((len(values), len(trials)))
-    total = np.einsum("ij,ij->i", values, values)
-    group = np.round(np.log(np.maximum(half_width, 1.0)) / np.log(1.15)).astype(int)
-    for key in np.unique(group):
-        members = np.flatnonzero(group == key)
-        width = float(np.exp(key * np.log(1.15)))
-        onto = _limb_spaces(width, blur, tuple(offsets.tolist()), tuple(trials.tolist()))
-        for block in np.array_split(members, -(-len(members) // _BLOCK)):
-            part = (values[block] @ onto).reshape(len(block), len(trials), -1)
-            cost[block] = total[block, None] - np.einsum("itk,itk->it", part, part)
-    return np.maximum(cost, 0.0)
+
+    limbs: NDArray[np.float32]
+    smooth: NDArray[np.float32]
+    group: IntArray
+
+    @classmethod
+    def of(cls, half_width: FloatArray, blur: float, offsets: FloatArray, trials: FloatArray) -> _Models:
+        """For profiles at offsets (Q,) [px] of pipes of `half_width` (N,) [px]."""
+        keys, group = np.unique(np.round(np.log(np.maximum(half_width, 1.0)) / WIDTH_STEP), return_inverse=True)
+        at, positions = tuple(offsets.tolist()), tuple(trials.tolist())
+        limbs = [_limb_spaces(float(np.exp(key * WIDTH_STEP)), blur, at, positions) for key in keys]
+        smooth = _smooth_space(6 if _is_thin(float(np.median(half_width))) else 5, at)
+        return cls(np.stack(limbs), smooth, group.astype(np.int64))
 
 
-@lru_cache(maxsize=64)
-def _limb_spaces(width: float, blur: float, offsets: tuple[float, ...], trials: tuple[float, ...]) -> FloatArray:
-    """Orthonormal bases (Q, T * 5 or 6) of the limb model at offsets (Q,) px for each trial position (T,)."""
-    grid = np.array(offsets)
-    bases = [np.linalg.qr(limb_basis(grid - trial, width, blur))[0] for trial in trials]
-    return np.asarray(np.concatenate(bases, axis=1), np.float64)
+@lru_cache(maxsize=1024)
+def _limb_spaces(
+    width: float, blur: float, offsets: tuple[float, ...], trials: tuple[float, ...]
+) -> NDArray[np.float32]:
+    """Orthonormal bases (Q, 6 * T) of the limb model at offsets (Q,) px for each trial position (T,)."""
+    away = np.subtract.outer(np.array(trials), np.array(offsets))
+    model = limb_basis(-away.ravel(), width, blur).reshape(*away.shape, -1)
+    basis = np.zeros((len(offsets), 6, len(trials)), np.float32)
+    basis[:, : model.shape[2]] = np.linalg.qr(model)[0].transpose(1, 2, 0)
+    return basis.reshape(len(offsets), -1)
 
 
-def smooth_cost(values: FloatArray, offsets: FloatArray, half_width: FloatArray) -> FloatArray:
-    """What a polynomial with as many coefficients as the limb model leaves (N,)."""
-    order = 6 if len(values) and _is_thin(float(np.median(half_width))) else 5
-    smooth = np.linalg.qr(np.vander(offsets / np.abs(offsets).max(), order))[0]
-    part = values @ smooth
-    return np.maximum(np.einsum("ij,ij->i", values, values) - np.einsum("ij,ij->i", part, part), 1e-9)
+@lru_cache(maxsize=256)
+def _smooth_space(order: int, offsets: tuple[float, ...]) -> NDArray[np.float32]:
+    """Orthonormal basis (Q, order) of polynomials at offsets (Q,) px."""
+    at = np.array(offsets)
+    return np.ascontiguousarray(np.linalg.qr(np.vander(at / np.abs(at).max(), order))[0], np.float32)
+
+
+def least_cost(
+    values: NDArray[np.floating], offsets: FloatArray, half_width: FloatArray, blur: float, trials: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What the limb model, at the best of the trial positions (T,), and a smooth profile leave of the squares (N,)."""
+    if not len(values):
+        return np.zeros(0), np.zeros(0)
+    cost, plain = _unexplained(values, offsets, half_width, blur, trials)
+    return cost.min(axis=1).astype(np.float64), plain.astype(np.float64)
 
 
 def limb_edges(
-    values: NDArray[np.floating],
-    offsets: FloatArray,
-    half_width: FloatArray,
-    blur: float,
-    reach: float,
+    values: NDArray[np.floating], offsets: FloatArray, half_width: FloatArray, blur: float, reach: float
 ) -> LimbEdges:
     """Edges within +-`reach` [px] of the origin of profiles `values` (N, Q) taken at `offsets` (Q,) [px].
 
     Local minima over the position of what the limb model leaves unexplained.
     """
-    light: FloatArray = np.asarray(values, np.float64)
     trials = np.arange(-reach, reach + 0.5 * TRIAL_STEP, TRIAL_STEP, dtype=float)
-    cost = limb_cost(light, offsets, half_width, blur, trials)
-    return _minima(cost, smooth_cost(light, offsets, half_width), trials, len(offsets))
+    if not len(values):
+        return LimbEdges(*(np.zeros((0, MOST_EDGES)) for _ in range(3)))
+    cost, plain = _unexplained(values, offsets, half_width, blur, trials)
+    return LimbEdges(*_minima(cost, plain, trials, max(len(offsets) - 6, 1), MOST_EDGES))
 
 
-def _minima(cost: FloatArray, plain: FloatArray, trials: FloatArray, samples: int) -> LimbEdges:
-    """The deepest local minima of cost (N, T) over trials (T,) [px], by parabolas; `plain` (N,): a smooth profile's."""
+def _unexplained(
+    values: NDArray[np.floating], offsets: FloatArray, half_width: FloatArray, blur: float, trials: FloatArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What the limb model at each trial position (N, T), and a smooth profile (N,), leave of the profiles' squares."""
+    models = _Models.of(half_width, blur, offsets, trials)
+    light = np.ascontiguousarray(values, np.float32)
+    return _costs(light, models.group, models.limbs, models.smooth, len(trials))
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _costs(
+    values: NDArray[np.float32],
+    group: IntArray,
+    limbs: NDArray[np.float32],
+    smooth: NDArray[np.float32],
+    trials: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """See `_unexplained`.
+
+    The model's levels follow by linear least squares (variable projection). Each profile's mean, which both models
+    hold, is removed first, so that float32 suffices: what is left is the contrast alone.
+    """
+    count, width = values.shape
+    cost = np.empty((count, trials), np.float32)
+    plain = np.empty(count, np.float32)
+    centred = np.empty(width, np.float32)
+    onto = np.empty(limbs.shape[2], np.float32)
+    for i in range(count):
+        mean = np.float32(0.0)
+        for j in range(width):
+            mean += values[i, j]
+        mean /= np.float32(width)
+        total = np.float32(0.0)
+        for j in range(width):
+            centred[j] = values[i, j] - mean
+            total += centred[j] * centred[j]
+        onto[:] = np.float32(0.0)
+        for j in range(width):
+            level = centred[j]
+            row = limbs[group[i], j]
+            for k in range(len(row)):
+                onto[k] += level * row[k]
+        for t in range(trials):
+            cost[i, t] = total
+        for k in range(len(onto) // trials):
+            for t in range(trials):
+                cost[i, t] -= onto[k * trials + t] * onto[k * trials + t]
+        for t in range(trials):
+            cost[i, t] = max(cost[i, t], np.float32(0.0))
+        for k in range(smooth.shape[1]):
+            part = np.float32(0.0)
+            for j in range(width):
+                part += centred[j] * smooth[j, k]
+            total -= part * part
+        plain[i] = max(total, np.float32(1e-9))
+    return cost, plain
+
+
+@njit(cache=True, nogil=True)
+def _minima(
+    cost: NDArray[np.float32], plain: NDArray[np.float32], trials: FloatArray, freedom: int, most: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Offset [px], sigma [px], explained share (N, M) of the `most` deepest local minima of cost (N, T), by parabolas.
+
+    `plain` (N,): what a smooth profile leaves; `freedom`: degrees of freedom of what a limb leaves.
+    """
+    count = len(cost)
+    offset = np.full((count, most), np.nan)
+    sigma = np.full((count, most), np.inf)
+    explained = np.zeros((count, most))
     step = trials[1] - trials[0]
-    inner = cost[:, 1:-1]
-    lowest = (inner <= cost[:, :-2]) & (inner < cost[:, 2:])
-    ranked = np.where(lowest, inner, np.inf)
-    order = np.argsort(ranked, axis=1, kind="stable")[:, :MOST_EDGES]
-    rows = np.arange(len(cost))[:, None]
-    found = np.isfinite(ranked[rows, order])
-    before, at, after = cost[rows, order], cost[rows, order + 1], cost[rows, order + 2]
-    curvature = np.maximum(before - 2.0 * at + after, 1e-12)
-    shift = 0.5 * (before - after) / curvature
-    variance = np.maximum(at - 0.25 * (before - after) * shift, 1e-9) / max(samples - 6, 1)
-    offset = np.where(found, trials[order + 1] + shift * step, np.nan)
-    sigma = np.where(found, step * np.sqrt(2.0 * variance / curvature), np.inf)
-    explained = np.where(found, np.clip(1.0 - at / plain[:, None], 0.0, 1.0), 0.0)
-    return LimbEdges(offset, sigma, explained)
+    place = np.empty(most, np.int64)
+    for i in range(count):
+        row = cost[i]
+        found = 0
+        for t in range(1, len(row) - 1):
+            if not (row[t] <= row[t - 1] and row[t] < row[t + 1]):
+                continue
+            if found < most:
+                found += 1
+            elif row[t] >= row[place[most - 1]]:
+                continue
+            rank = found - 1
+            while rank > 0 and row[t] < row[place[rank - 1]]:
+                place[rank] = place[rank - 1]
+                rank -= 1
+            place[rank] = t
+        for m in range(found):
+            before, at, after = float(row[place[m] - 1]), float(row[place[m]]), float(row[place[m] + 1])
+            curvature = max(before - 2.0 * at + after, 1e-12)
+            shift = 0.5 * (before - after) / curvature
+            variance = max(at - 0.25 * (before - after) * shift, 1e-9) / freedom
+            offset[i, m] = trials[place[m]] + shift * step
+            sigma[i, m] = step * np.sqrt(2.0 * variance / curvature)
+            explained[i, m] = min(max(1.0 - at / plain[i], 0.0), 1.0)
+    return offset, sigma, explained

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.octree import THREADS
-from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ContourSamples
+from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ContourSamples, parts_by_view
 from pipeprog_detect.types import Cylinder, View
 
 # Cells across an image, and points at the most that fill them: 12 in each of the 160 x 90 cells of a view that shows a
@@ -50,13 +50,12 @@ def visible(
     """Mask (N,) of the cylinder's samples that neither one of the `others` nor the cloud hides from their view."""
     result = np.ones(len(samples), bool)
     rows = cylinder_rows(others)
-    for index, view in enumerate(views):
-        chosen = np.flatnonzero(samples.view == index)
-        if len(chosen):
-            on_axis = cylinder.middle + samples.along[chosen, None] * cylinder.axis
-            depth = (on_axis - view.centre) @ view.camera_from_map[2, :3]
-            result[chosen] = ~hidden_by_cylinders(view, samples.pixel[chosen], depth, rows)
-            result[chosen] &= ~hidden_by_cloud(view, samples.pixel[chosen], depth - cylinder.radius)
+    for index, part in parts_by_view(samples, len(views)):
+        view, pixel = views[index], samples.pixel[part]
+        towards = view.camera_from_map[2, :3]
+        depth = samples.along[part] * (cylinder.axis @ towards) + (cylinder.middle - view.centre) @ towards
+        hidden = hidden_by_cylinders(view, pixel, depth, rows)
+        result[part] = ~(hidden | hidden_by_cloud(view, pixel, depth - cylinder.radius))
     return result
 
 
@@ -71,24 +70,45 @@ def hidden_by_cylinders(view: View, pixel: FloatArray, depth: FloatArray, cylind
     `cylinders` (K, 8): as `cylinder_rows` gives them.
     """
     camera = view.camera
-    rays = np.stack(
-        [(pixel[:, 0] - camera.cx) / camera.fx, (pixel[:, 1] - camera.cy) / camera.fy, np.ones(len(depth))], axis=1
-    )
-    return _passing(cylinders, view.centre, rays @ view.camera_from_map[:3, :3], depth, MARGIN / camera.fx)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    rotation = np.ascontiguousarray(view.camera_from_map[:3, :3])
+    return _passing(cylinders, view.centre, rotation, lens, pixel, depth, MARGIN / camera.fx)
 
 
 @njit(cache=True, nogil=True)
 def _passing(
-    cylinders: FloatArray, centre: FloatArray, rays: FloatArray, own_depth: FloatArray, margin: float
+    cylinders: FloatArray,
+    centre: FloatArray,
+    rotation: FloatArray,
+    lens: FloatArray,
+    pixel: FloatArray,
+    own_depth: FloatArray,
+    margin: float,
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of rays (N, 3) with unit depth that meet a cylinder, grown by `margin` x depth, before `own_depth`."""
-    result = np.zeros(len(rays), np.bool_)
+    """Mask (N,) of pixel (N, 2) whose lines of sight meet a cylinder, grown by `margin` x depth, before `own_depth`.
+
+    `rotation` (3, 3): camera_from_map; `lens`: fx, fy, cx, cy.
+    """
+    count = len(pixel)
+    result = np.zeros(count, np.bool_)
+    rays = np.empty((count, 3))
+    deepest = 0.0
+    for i in range(count):
+        u, v = (pixel[i, 0] - lens[2]) / lens[0], (pixel[i, 1] - lens[3]) / lens[1]
+        for k in range(3):
+            rays[i, k] = u * rotation[0, k] + v * rotation[1, k] + rotation[2, k]
+        deepest = max(deepest, own_depth[i])
     for k in range(len(cylinders)):
         ax, ay, az, length, radius = cylinders[k, 3:8]
         x, y, z = cylinders[k, 0] - centre[0], cylinders[k, 1] - centre[1], cylinders[k, 2] - centre[2]
+        nearest = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        run = length * (rotation[2, 0] * ax + rotation[2, 1] * ay + rotation[2, 2] * az)
+        reach = radius + margin * deepest
+        if max(nearest, nearest + run) < -2.0 * reach or min(nearest, nearest + run) > deepest + 2.0 * reach:
+            continue  # all of it, grown as far as it can be, behind the camera or behind the points
         before = ax * x + ay * y + az * z
         x, y, z = x - before * ax, y - before * ay, z - before * az
-        for i in range(len(rays)):
+        for i in range(count):
             if result[i]:
                 continue
             along = rays[i, 0] * ax + rays[i, 1] * ay + rays[i, 2] * az
@@ -107,14 +127,28 @@ def hidden_by_cloud(view: View, pixel: FloatArray, depth: FloatArray) -> NDArray
     """Mask (N,) of points of one surface, seen at pixel (N, 2) at depth (N,) [m], behind something in the cloud."""
     if view.nearest is None or not len(depth):
         return np.zeros(len(depth), bool)
-    cell = view.camera.width / view.nearest.shape[1]
-    row, column = (
-        np.clip((pixel[:, axis] / cell).astype(np.int64), 0, view.nearest.shape[1 - axis] - 1) for axis in (1, 0)
-    )
+    return _behind(view.nearest, view.camera.width / view.nearest.shape[1], pixel, depth)
+
+
+@njit(cache=True, nogil=True)
+def _behind(nearest: NDArray[np.float32], cell: float, pixel: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
+    """See `hidden_by_cloud`; `nearest` (h, w): depth [m] of the surface in each cell of `cell` [px]."""
+    count = len(depth)
+    rows, columns = nearest.shape
+    low, high = pixel[0].copy(), pixel[0].copy()
+    least, most = 1.0 / depth[0], 1.0 / depth[0]
+    for i in range(count):
+        for k in range(2):
+            low[k], high[k] = min(low[k], pixel[i, k]), max(high[k], pixel[i, k])
+        least, most = min(least, 1.0 / depth[i]), max(most, 1.0 / depth[i])
     # A surface seen at a slant is nearer at one edge of the cell than at the other: inverse depth is linear in pixels.
-    slope = float(np.ptp(1.0 / depth)) / max(float(np.linalg.norm(np.ptp(pixel, axis=0))), cell)
-    slant = slope * cell * depth**2
-    return np.asarray(view.nearest[row, column] < depth - BEFORE - slant, bool)
+    slope = (most - least) / max(np.hypot(high[0] - low[0], high[1] - low[1]), cell)
+    result = np.empty(count, np.bool_)
+    for i in range(count):
+        row = min(max(int(pixel[i, 1] / cell), 0), rows - 1)
+        column = min(max(int(pixel[i, 0] / cell), 0), columns - 1)
+        result[i] = nearest[row, column] < depth[i] - BEFORE - slope * cell * depth[i] ** 2
+    return result
 
 
 @njit(cache=True, nogil=True)

@@ -5,15 +5,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, project
+from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ViewArrays, project
 from pipeprog_detect.silhouette.extension import AxialEvidence, axial_evidence
-from pipeprog_detect.silhouette.limb_edges import LINEAR_LIGHT
+from pipeprog_detect.silhouette.light_sampling import light_at
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, hidden_by_cloud, hidden_by_cylinders
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
@@ -93,7 +92,11 @@ def find_end(scene: Scene, at_end: bool, surface_end: float | None) -> End | Non
     pixel = pixel / scene.views[0].camera.fx
     along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL, dtype=float)
     rows = cylinder_rows(scene.others)
-    edges = np.concatenate([_slopes(barrel, along, view, rows) for view in scene.views])
+    axis = barrel.end + along[::SAMPLES_PER_PIXEL, None] * barrel.axis
+    looking = np.flatnonzero(ViewArrays.of(scene.views).showing(axis))
+    if not len(looking):
+        return None
+    edges = np.concatenate([_slopes(barrel, along, scene.views[index], rows) for index in looking])
     seen = np.isfinite(edges)
     if not seen.any():
         return None
@@ -140,6 +143,7 @@ def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: FloatArray)
     towards = view.centre - end
     towards = towards - axis * (axis @ towards)
     towards = towards / np.linalg.norm(towards)
+    unseen = np.full((SECTORS, len(along)), np.nan)
     angle = np.linspace(-HALF_ARC, HALF_ARC, SECTORS * RAYS_PER_SECTOR)
     radial = np.cos(angle)[:, None] * towards + np.sin(angle)[:, None] * np.cross(axis, towards)
     points = end + along[None, :, None] * axis + barrel.radius * radial[:, None]
@@ -156,13 +160,10 @@ def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: FloatArray)
     inside = sharp.reshape(SECTORS, RAYS_PER_SECTOR, -1).all(axis=1)
     inside = minimum_filter1d(inside, 2 * BESIDE_HIDDEN * SAMPLES_PER_PIXEL + 1, axis=1)
     if not inside.any():
-        return np.full(inside.shape, np.nan)
-    low = np.maximum(np.floor(pixel[sharp].min(axis=0)).astype(int) - 2, 0)
-    high = np.ceil(pixel[sharp].max(axis=0)).astype(int) + 3
-    light = cv2.LUT(np.ascontiguousarray(view.image[low[1] : high[1], low[0] : high[0]]), LINEAR_LIGHT)
-    where = (pixel - low).astype(np.float32).reshape(len(angle), len(along), 2)
-    light = cv2.remap(light, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    mean = light.reshape(SECTORS, RAYS_PER_SECTOR, -1).mean(axis=1, dtype=float)
+        return unseen
+    light = np.zeros(len(pixel))
+    light[sharp] = light_at(view.image, pixel[sharp])
+    mean = light.reshape(SECTORS, RAYS_PER_SECTOR, -1).mean(axis=1)
     return np.where(inside, gaussian_filter1d(mean, SAMPLES_PER_PIXEL, axis=1, order=1), np.nan)
 
 

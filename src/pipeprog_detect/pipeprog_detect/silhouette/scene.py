@@ -6,25 +6,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import (
     ContourSamples,
+    ViewArrays,
     contour_samples,
+    parts_by_view,
 )
 from pipeprog_detect.silhouette.edge_support import SupportProfile, hits, support_profile
+from pipeprog_detect.silhouette.light_sampling import light_across
 from pipeprog_detect.silhouette.limb_edges import (
     INWARD,
-    LINEAR_LIGHT,
+    TRIAL_STEP,
     WINDOW_OF_HALF_WIDTH,
     LimbEdges,
     Profiles,
-    limb_cost,
+    least_cost,
     limb_edges,
-    smooth_cost,
 )
 from pipeprog_detect.silhouette.occlusion import visible
 from pipeprog_detect.types import Cylinder, View
@@ -33,6 +34,8 @@ from pipeprog_detect.types import Cylinder, View
 SPACING = 12
 # The limb model's window outside the pipe, where the next thing may begin: this width [px], and three blurs.
 OUTWARD, OUTWARD_OF_BLUR = 1.5, 3.0
+# Distance of the light's samples across the contour [px]: half of what an image resolves.
+STEP = 0.5
 # Blur of a sharp image, lens and pixel together, and the ones that are tried [px].
 SHARP = 0.5
 BLURS = np.array([0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.5])
@@ -41,6 +44,9 @@ BLUR_REACH, BLUR_SAMPLES = 0.8, 600
 # A sample shows a clear edge where the limb model leaves less than this share of what a smooth profile leaves. At least
 # four such samples measure the blur of one line (a view's one side), and three lines that of the images.
 CLEAR, LEAST_CLEAR, LEAST_LINES = 0.4, 4, 3
+# The measured blur is rounded to steps of 2 %, a tenth of what tells it from the next one tried, so that the models of
+# one pipe serve for others.
+BLUR_STEP = 0.02
 # Surfaces only soften an edge: of all lines' blurs the lowest tenth is that of the images.
 SHARPEST = 0.1
 # On a thin pipe edges count within this share of its half-width, and at least within a blur of the contour [px].
@@ -89,10 +95,9 @@ class Scene:
 
     def within(self, reach: float) -> float:
         """`reach` [px], but less on a thin pipe, whose two contour lines and highlight lie within some pixels."""
-        distance = [np.linalg.norm(view.centre - self.cylinder.middle) for view in self.views]
-        radius = self.cylinder.radius
-        half_width = [view.camera.fx * radius / each for view, each in zip(self.views, distance, strict=True)]
-        return float(min(reach, max(THIN_REACH * np.median(half_width), LEAST_REACH)))
+        gains = ViewArrays.of(self.views).pixels_per_metre(self.cylinder.middle)
+        reach = min(reach, max(THIN_REACH * self.cylinder.radius * float(np.median(gains)), LEAST_REACH))
+        return TRIAL_STEP * round(reach / TRIAL_STEP)
 
     def samples(self, spacing: int = SPACING, margin: float = 4.0) -> ContourSamples:
         """Samples of the cylinder's contour, about `spacing` [px] apart, that nothing hides."""
@@ -100,7 +105,7 @@ class Scene:
         return samples.select(visible(samples, self.cylinder, self.views, self.others))
 
     def edges(self, reach: float, spacing: int = SPACING, limit: int | None = None) -> tuple[ContourSamples, LimbEdges]:
-        """Visible samples, about `limit` at the most, and the limb edges within `reach` [px] of them.
+        """Visible samples, `limit` at the most, and the limb edges within `reach` [px] of them.
 
         The edges' offsets are from the predicted contour; they are sought about where the views' offsets put it.
         """
@@ -123,10 +128,9 @@ class Scene:
         Samples outside the image repeat its border.
         """
         result = np.empty((len(samples), len(offsets)), np.float32)
-        for index, view in enumerate(self.views):
-            chosen = np.flatnonzero(samples.view == index)
-            if len(chosen):
-                result[chosen] = _light(view, samples.pixel[chosen], samples.normal[chosen], offsets, lines)
+        for index, part in parts_by_view(samples, len(self.views)):
+            image = self.views[index].image
+            result[part] = light_across(image, samples.pixel[part], samples.normal[part], offsets, lines)
         return result
 
     def wide_profiles(self, samples: ContourSamples, furthest: float) -> Profiles:
@@ -142,8 +146,8 @@ class Scene:
         if not len(samples):
             return SHARP
         trials = np.arange(-BLUR_REACH, BLUR_REACH + 0.1, 0.2, dtype=float)
-        left = [limb_cost(values, offsets, samples.half_width, float(blur), trials).min(axis=1) for blur in BLURS]
-        cost = np.log(np.stack(left) / smooth_cost(values, offsets, samples.half_width) + 1e-4)
+        tried = [least_cost(values, offsets, samples.half_width, float(blur), trials) for blur in BLURS]
+        cost = np.log(np.stack([limb for limb, _ in tried]) / tried[0][1] + 1e-4)
         clear = cost.min(axis=0) < np.log(CLEAR)
         line = 2 * samples.view + samples.side
         best = []
@@ -151,9 +155,13 @@ class Scene:
             members = clear & (line == one)
             if members.sum() >= LEAST_CLEAR:
                 best.append(_lowest(np.log(BLURS), cost[:, members].sum(axis=1)))
-        return float(np.exp(np.quantile(best, SHARPEST))) if len(best) >= LEAST_LINES else SHARP
+        if len(best) < LEAST_LINES:
+            return SHARP
+        return float(np.exp(BLUR_STEP * np.round(np.quantile(best, SHARPEST) / BLUR_STEP)))
 
-    def _profiles(self, reach: float, spacing: int, limit: int | None) -> tuple[ContourSamples, FloatArray, FloatArray]:
+    def _profiles(
+        self, reach: float, spacing: int, limit: int | None
+    ) -> tuple[ContourSamples, FloatArray, NDArray[np.float32]]:
         """Visible samples, offsets (Q,) [px] and light (N, Q) there, from where the views' offsets put the contour."""
         samples = self.samples(spacing, margin=INWARD)
         if limit is not None:
@@ -162,10 +170,11 @@ class Scene:
         if len(samples):
             inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(samples.half_width)))
         outward = OUTWARD + OUTWARD_OF_BLUR * self.blur
-        offsets = np.arange(-inward - reach, outward + 0.25, 0.5, dtype=float)
+        first = -TRIAL_STEP * round((inward + reach) / TRIAL_STEP)  # few different ones, whose models serve again
+        offsets = np.arange(first, outward + 0.5 * STEP, STEP, dtype=float)
         pixel = samples.pixel + self.shift_of(samples)[:, None] * samples.normal
         values = self.light(replace(samples, pixel=pixel), offsets, spacing)
-        return samples, offsets, np.asarray(values, float)
+        return samples, offsets, values
 
 
 def frame(cylinder: Cylinder, towards: FloatArray) -> FloatArray:
@@ -183,27 +192,8 @@ def frame(cylinder: Cylinder, towards: FloatArray) -> FloatArray:
 
 def viewing_direction(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
     """Mean unit vector (3,) from the cameras to the cylinder's middle."""
-    directions = [cylinder.middle - view.centre for view in views]
-    return np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
-
-
-def _light(view: View, pixel: FloatArray, normal: FloatArray, offsets: FloatArray, lines: int) -> NDArray[np.float32]:
-    """Light (N, Q) of one view along normals (N, 2) through pixel (N, 2), the mean of parallels one pixel apart."""
-    shifts = np.arange(lines) - 0.5 * (lines - 1)
-    tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-    feet = (pixel[:, None] + shifts[None, :, None] * tangent[:, None]).reshape(-1, 2)
-    outward = np.repeat(normal, lines, axis=0)
-    size = np.array([view.camera.width, view.camera.height])
-    tips = np.stack([feet + offsets[0] * outward, feet + offsets[-1] * outward])
-    low = np.clip(np.floor(tips.min(axis=(0, 1))).astype(int) - 2, 0, size - 1)
-    high = np.clip(np.ceil(tips.max(axis=(0, 1))).astype(int) + 3, low + 1, size)
-    light = cv2.LUT(np.ascontiguousarray(view.image[low[1] : high[1], low[0] : high[0]]), LINEAR_LIGHT)
-    along = offsets.astype(np.float32)
-    x, y = (np.multiply.outer(outward[:, k].astype(np.float32), along) for k in (0, 1))
-    x += (feet[:, :1] - low[0]).astype(np.float32)
-    y += (feet[:, 1:] - low[1]).astype(np.float32)
-    sampled = cv2.remap(light, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(sampled.reshape(len(pixel), lines, -1).mean(axis=1, dtype=np.float32))
+    directions = cylinder.middle - ViewArrays.of(views).centres
+    return np.asarray((directions / np.linalg.norm(directions, axis=1)[:, None]).mean(axis=0), np.float64)
 
 
 def _lowest(x: FloatArray, cost: FloatArray) -> float:
