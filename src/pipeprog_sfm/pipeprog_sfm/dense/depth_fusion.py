@@ -153,16 +153,9 @@ class _VoxelHash:
 
     def cloud(self) -> FusedCloud:
         n = self._size
-        sums = self._sums[:n].astype(float)
-        mean = sums[:, 1:] / sums[:, :1]
-        points = _unpack(self._keys[:n]) * self._voxel + mean[:, :3]
-        normals = mean[:, 3:6] / np.maximum(np.linalg.norm(mean[:, 3:6], axis=1, keepdims=True), 1e-12)
-        return FusedCloud(
-            points.astype(np.float32),
-            normals.astype(np.float32),
-            np.clip(np.rint(mean[:, 6:9]), 0, 255).astype(np.uint8),
-            self._views[:n].copy(),
-        )
+        points, normals, colors = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty((n, 3), np.uint8)
+        _average(self._keys[:n], self._sums[:n], self._voxel, points, normals, colors)
+        return FusedCloud(points, normals, colors, self._views[:n].copy())
 
     def _grow(self) -> None:
         self._table = np.full(2 * len(self._table), -1, np.int32)
@@ -181,8 +174,19 @@ _HALF = 1 << (_BITS - 1)
 _MASK = (1 << _BITS) - 1
 
 
-def _unpack(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.stack([(keys >> (2 * _BITS)) & _MASK, (keys >> _BITS) & _MASK, keys & _MASK], axis=1) - _HALF
+@njit(cache=True, nogil=True)
+def _average(keys, sums, voxel, points, normals, colors):  # type: ignore[no-untyped-def]
+    """Points, unit normals and colours of voxels from their keys and sums; in doubles, as the map may be kilometres."""
+    for n in range(len(keys)):
+        weight, square = np.float64(sums[n, 0]), 0.0
+        for k in range(3):
+            cell = ((keys[n] >> ((2 - k) * _BITS)) & _MASK) - _HALF
+            points[n, k] = cell * voxel + np.float64(sums[n, 1 + k]) / weight
+            square += (np.float64(sums[n, 4 + k]) / weight) ** 2
+            colors[n, k] = min(max(np.rint(np.float64(sums[n, 7 + k]) / weight), 0.0), 255.0)
+        length = max(np.sqrt(square), 1e-12)
+        for k in range(3):
+            normals[n, k] = np.float64(sums[n, 4 + k]) / weight / length
 
 
 @njit(cache=True, nogil=True)
