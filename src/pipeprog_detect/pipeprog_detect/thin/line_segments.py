@@ -80,7 +80,7 @@ def segment_pairs(edges: FloatArray, narrowest: float, widest: float) -> Segment
     return SegmentPairs(np.array(ends, np.float64).reshape(-1, 2, 2), np.array(widths, np.float64).reshape(-1, 2))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _joined(segments: FloatArray) -> FloatArray:
     """Edges (M, 2, 2) made of the segments (N, 2, 2), longest first, that lie on one line without a long gap."""
     count = len(segments)

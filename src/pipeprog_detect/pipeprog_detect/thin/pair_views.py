@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -53,8 +55,10 @@ def pair_views(
         known: cylinders in whose silhouettes no segment pairs are sought.
         edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
-    seen = (_pair_view(view, points, radii, known, edges) for view in _apart(views, points))
-    return [each for each in seen if each is not None]
+    # Most of the time is OpenCV's line segments, which leave the interpreter to the other threads.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        seen = pool.map(lambda view: _pair_view(view, points, radii, known, edges), _apart(views, points))
+        return [each for each in seen if each is not None]
 
 
 def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
