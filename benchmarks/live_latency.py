@@ -83,8 +83,8 @@ class Robot(Node):
         return self._health.get(name) == IDLE[name]
 
     def _is_over(self) -> bool:
-        quiet = time.monotonic() - max(self._heard, self._started) > QUIET
-        return quiet and self._revisions["map"] == self._revisions["pipes"]
+        quiet = time.monotonic() - self._heard > QUIET
+        return quiet and 0 < self._revisions["map"] == self._revisions["pipes"]
 
     def _wait(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + PATIENCE
@@ -102,7 +102,9 @@ class Robot(Node):
             self._health[status.name.partition(":")[0]] = status.message
 
     def _on_status(self, message: msg.SfmStatus) -> None:
-        self.keyframes = message.keyframes_registered
+        if message.keyframes_registered > self.keyframes:
+            self.keyframes = message.keyframes_registered
+            self._heard = time.monotonic()
         if message.metric and "board measured" not in self.moments:
             self._note("board measured")
         if message.map_revision > self._revisions["map"]:
