@@ -119,7 +119,7 @@ def _parameters(request: Request, configs: dict[str, Any], colmap: Path) -> dict
     """The ROS parameters of each node: its settings, and the files that it reads or writes."""
     parameters = as_parameters(configs)
     board = str(request.board.resolve()) if request.board else ""
-    parameters["sfm"] |= {"lockstep": True, "board": board, "colmap": str(colmap.resolve())}
+    parameters["sfm"] |= {"lockstep": True, "board": board, "colmap": str(colmap.resolve()), "intermediate": False}
     parameters["detect"] |= {"boq": str(request.boq.resolve()), "intermediate": False}
     return parameters
 

@@ -233,9 +233,12 @@ class SfmNode(Node):
 
     def __init__(self) -> None:
         super().__init__("sfm")
-        config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep"))
+        config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep", "intermediate"))
         board = declare_fixed(self, "board", "", "file of the boards on site")
-        self._arguments = config, load_board_file(board) if board else BoardFile()
+        intermediate = declare_fixed(
+            self, "intermediate", True, "publish maps while keyframes come, not the last alone"
+        )
+        self._arguments = config, load_board_file(board) if board else BoardFile(), intermediate
         self._colmap = declare_fixed(self, "colmap", "", "folder for the sparse model")
         self._lockstep = declare_fixed(self, "lockstep", False, "every message counts, as in a replay")
         self._supervision = Supervision(self._start_worker, "the reconstruction process")

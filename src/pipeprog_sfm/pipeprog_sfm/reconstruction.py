@@ -150,8 +150,7 @@ class Reconstruction:
         """Registers what still can be, adjusts everything, and makes the final map; raises NotMetricError."""
         self._mapper.finish()
         self._scaled = -1
-        self._dense.update(self._map.camera_from_model(), self._images, self._map.points_seen, complete=True)
-        self._request(complete=True)
+        self._request(settled=True, anew=True)
         return self._take()
 
     def write_colmap(self, folder: Path) -> None:
@@ -192,9 +191,12 @@ class Reconstruction:
         """The poses as they stand; raises NotMetricError while there are no poses or no scale."""
         return self._metric()[1]
 
-    def request_map(self) -> None:
-        """Starts to make a map of what is there; raises NotMetricError."""
-        self._request(complete=False)
+    def request_map(self, settled: bool) -> None:
+        """Starts to make a map; raises NotMetricError.
+
+        settled: no keyframe is expected soon, so that the map is of all depth maps; else of those that are there.
+        """
+        self._request(settled, anew=False)
 
     @property
     def is_mapping(self) -> bool:
@@ -205,10 +207,12 @@ class Reconstruction:
         """The map that was requested, once it is there; raises NotMetricError when there is no surface in it yet."""
         return self._take() if self._pending is not None and self._pending[2].done() else None
 
-    def _request(self, complete: bool) -> None:
+    def _request(self, settled: bool, anew: bool) -> None:
+        if settled:
+            self._dense.update(self._map.camera_from_model(), self._images, self._map.points_seen, complete=True)
         scale, trajectory = self._metric()
         camera_from_map = dict(zip(trajectory.stamps.tolist(), np.linalg.inv(trajectory.map_from_camera), strict=True))
-        cloud = self._dense.fuse(camera_from_map, self._map.camera_from_model(), scale.scale, complete)
+        cloud = self._dense.fuse(camera_from_map, self._map.camera_from_model(), scale.scale, settled, anew)
         self._pending = scale, trajectory, cloud
 
     def _take(self) -> MetricMap:

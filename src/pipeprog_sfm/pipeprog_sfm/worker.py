@@ -121,28 +121,35 @@ class Channel(Protocol):
 
 
 def serve(
-    connection: Connection, config: SfmConfig, board_file: BoardFile, answered: Iterable[AddKeyframe | Retire]
+    connection: Connection,
+    config: SfmConfig,
+    board_file: BoardFile,
+    intermediate: bool,
+    answered: Iterable[AddKeyframe | Retire],
 ) -> None:
-    """Processes commands from `connection` until it closes; those that a predecessor has answered come first."""
+    """Processes commands from `connection` until it closes; those that a predecessor has answered come first.
+
+    Without `intermediate`, the only map is the one that Finish asks for.
+    """
     warm_up(config)
-    work(connection, Reconstruction(config, board_file), config.map_interval, answered)
+    work(connection, Reconstruction(config, board_file), config.map_interval if intermediate else None, answered)
 
 
 def work(
     channel: Channel,
     reconstruction: Reconstruction,
-    map_interval: int,
+    map_interval: int | None,
     answered: Iterable[AddKeyframe | Retire],
     clock: Callable[[], float] = time.monotonic,
 ) -> None:
-    """As `serve`; a map is requested after `map_interval` keyframes, or IDLE_SECONDS without a command."""
+    """As `serve`; a map is requested after `map_interval` keyframes, or IDLE_SECONDS without a command; None: never."""
     for earlier in answered:
         _answer(reconstruction, earlier)
         reconstruction.update_dense()
     channel.send(Ready())
     since_map, idle_since = 0, clock()
     while True:
-        busy = since_map > 0 or reconstruction.is_mapping
+        busy = map_interval is not None and (since_map > 0 or reconstruction.is_mapping)
         if channel.poll(POLL_SECONDS if busy else None):
             command = channel.recv()
             if isinstance(command, Finish):
@@ -155,6 +162,8 @@ def work(
                 reconstruction.update_dense()  # once the pose is out
                 since_map += 1
             idle_since = clock()
+        if map_interval is None:
+            continue
         try:
             metric_map = reconstruction.finished_map()
         except NotMetricError:
@@ -165,7 +174,7 @@ def work(
         if not reconstruction.is_mapping and (since_map >= map_interval or idle):
             since_map = 0
             with contextlib.suppress(NotMetricError):  # the status says why
-                reconstruction.request_map()
+                reconstruction.request_map(settled=idle)
 
 
 def _answer(reconstruction: Reconstruction, command: AddKeyframe | Retire) -> KeyframeDone | Retired:

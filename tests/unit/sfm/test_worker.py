@@ -22,6 +22,7 @@ class Prompt:
     def __init__(self) -> None:
         self.is_mapping = False
         self.keyframes: list[int] = []
+        self.settled = False
 
     def add(self, stamp: int, *keyframe: object) -> None:
         self.keyframes.append(stamp)
@@ -44,12 +45,12 @@ class Prompt:
     def overlap_reports(self) -> list[object]:
         return []
 
-    def request_map(self) -> None:
-        self.is_mapping = True
+    def request_map(self, settled: bool) -> None:
+        self.is_mapping, self.settled = True, settled
 
     def finished_map(self) -> str | None:
         ready, self.is_mapping = self.is_mapping, False
-        return "early map" if ready else None
+        return ("settled map" if self.settled else "early map") if ready else None
 
     def finish(self) -> str:
         return "last map"
@@ -86,11 +87,15 @@ class Script:
         self.events.append(event)
 
 
-def events(*steps: worker.Command | float, answered: tuple[worker.AddKeyframe, ...] = ()) -> list[Any]:
+def events(
+    *steps: worker.Command | float,
+    answered: tuple[worker.AddKeyframe, ...] = (),
+    map_interval: int | None = MAP_INTERVAL,
+) -> list[Any]:
     """What the loop sends until the connection closes."""
     script = Script(*steps)
     with pytest.raises(EOFError):
-        worker.work(script, cast(Any, Prompt()), MAP_INTERVAL, answered, lambda: script.now)
+        worker.work(script, cast(Any, Prompt()), map_interval, answered, lambda: script.now)
     return script.events
 
 
@@ -101,10 +106,10 @@ def test_no_map_follows_the_last_one() -> None:
     assert sent[2].map == "last map"
 
 
-def test_an_early_map_comes_when_no_keyframe_does() -> None:
+def test_a_map_of_all_there_is_comes_when_no_keyframe_does() -> None:
     sent = events(KEYFRAME, IDLE_SECONDS + 3 * POLL_SECONDS)
     assert [type(event) for event in sent] == [worker.Ready, worker.KeyframeDone, worker.MapReady]
-    assert sent[2].map == "early map"
+    assert sent[2].map == "settled map"
 
 
 def test_no_early_map_comes_while_keyframes_do() -> None:
@@ -116,6 +121,14 @@ def test_a_map_comes_after_each_interval_of_keyframes() -> None:
     sent = events(*[KEYFRAME] * (MAP_INTERVAL + 1))
     done = [worker.KeyframeDone] * MAP_INTERVAL
     assert [type(event) for event in sent] == [worker.Ready, *done, worker.KeyframeDone, worker.MapReady]
+    assert sent[-1].map == "early map"
+
+
+def test_without_an_interval_the_last_map_is_the_only_one() -> None:
+    sent = events(*[KEYFRAME] * 4, 10 * IDLE_SECONDS, worker.Finish(), map_interval=None)
+    kinds = [worker.Ready, *[worker.KeyframeDone] * 4, worker.MapReady, worker.Finished]
+    assert [type(event) for event in sent] == kinds
+    assert sent[-2].map == "last map"
 
 
 def test_what_a_predecessor_answered_is_not_answered_again() -> None:

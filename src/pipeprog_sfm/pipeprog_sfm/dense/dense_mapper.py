@@ -108,11 +108,12 @@ class DenseMapper:
         camera_from_model: Mapping[int, FloatArray],
         scale: float,
         complete: bool,
+        anew: bool,
     ) -> Future[FusedCloud]:
         """The cloud for rigid poses in metres, `scale` metres per unit of the model.
 
-        If complete, it is made anew from all depth maps; else what is there is added to the last one, unless the poses
-        have moved by more than a voxel.
+        Of all depth maps if complete, else of those that are there. They are added to the last cloud, unless it is to
+        be made anew or the poses have moved by more than a voxel.
         """
         self._submit(all_of_them=complete)
         maps = {}
@@ -120,7 +121,7 @@ class DenseMapper:
             future = self._depths.get(stamp)
             if future is not None and (complete or future.done()):
                 maps[stamp] = (future, pose)
-        return self._thread.submit(self._fuse, maps, dict(camera_from_model), scale, complete)
+        return self._thread.submit(self._fuse, maps, dict(camera_from_model), scale, anew)
 
     def _consider(
         self, stamp: int, poses: Mapping[int, FloatArray], images: Mapping[int, EncodedImage], points: FloatArray
@@ -179,11 +180,11 @@ class DenseMapper:
         maps: Mapping[int, tuple[Future[_Depth], FloatArray]],
         camera_from_model: Mapping[int, FloatArray],
         scale: float,
-        complete: bool,
+        anew: bool,
     ) -> FusedCloud:
         poses = {stamp: pose for stamp, (_, pose) in maps.items()}
         moved = [distance(poses[stamp], pose) for stamp, pose in self._fused.items() if stamp in poses]
-        if complete or max(moved, default=0.0) > self._fusion_config.voxel:
+        if anew or max(moved, default=0.0) > self._fusion_config.voxel:
             self._fusion, self._fused = Fusion(self._fusion_config), {}
         for stamp, (future, pose) in maps.items():
             if stamp in self._fused:

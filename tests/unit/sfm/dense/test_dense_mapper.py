@@ -62,7 +62,7 @@ def there() -> tuple[DenseMapper, dict[int, np.ndarray], list[int]]:
 
 def test_the_cloud_is_the_wall(there: tuple[DenseMapper, dict[int, np.ndarray], list[int]]) -> None:
     dense, poses, _ = there
-    cloud = dense.fuse(poses, poses, 1.0, complete=True).result()
+    cloud = dense.fuse(poses, poses, 1.0, complete=True, anew=True).result()
     assert len(cloud.points) > 5000  # 1.1 m x 0.7 m are seen thrice, a pixel of the depth maps is 9 mm
     # 0.1 px of disparity at the baseline of two steps: 0.1 / 32 of the distance
     assert np.median(np.abs(cloud.points[:, 2] - 1.0)) < 0.003
@@ -76,7 +76,7 @@ def test_lengths_follow_the_scale_and_the_drift_of_the_unit(
     halved = {stamp: matrix.copy() for stamp, matrix in poses.items()}
     for matrix in halved.values():
         matrix[:3, 3] /= 2.0  # the model has shrunk since the depth maps were made
-    cloud = dense.fuse(poses, halved, 2.0, complete=True).result()
+    cloud = dense.fuse(poses, halved, 2.0, complete=True, anew=True).result()
     assert np.median(np.abs(cloud.points[:, 2] - 1.0)) < 0.003
 
 
@@ -95,7 +95,7 @@ def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
     left = {stamp: matrix for stamp, matrix in poses.items() if stamp % 2 == 1}
     dense.update(left, images, lambda other: seen(left[other]), complete=True)
     assert len(dense) >= counts[-1] - 1
-    assert len(dense.fuse(left, left, 1.0, complete=True).result().points) > 1000
+    assert len(dense.fuse(left, left, 1.0, complete=True, anew=True).result().points) > 1000
 
 
 def test_overlap_is_the_share_seen_from_the_same_side() -> None:
