@@ -18,18 +18,22 @@ def read_json(path: str | Path, most: int = MAX_JSON) -> dict[str, Any]:
 
     Raises InputError, naming the file, the line and the remedy, where there is none.
     """
-    text = read_text(path, most)
+    return parse_json(read_text(path, most), str(path))
+
+
+def parse_json(text: str, source: str) -> dict[str, Any]:
+    """As read_json, of a text; `source` names it in errors."""
     try:
         content = json.loads(text, parse_constant=_constant, parse_int=_integer, parse_float=_finite)
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}: is not JSON ({error.msg}): write the file again") from None
+        raise InputError(f"{source}, line {error.lineno}: is not JSON ({error.msg}): write the file again") from None
     except RecursionError:
-        raise InputError(f"{path}: lists within lists beyond all measure: write the file again") from None
+        raise InputError(f"{source}: lists within lists beyond all measure: write the file again") from None
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{source}: {error}") from None
     if not isinstance(content, dict):
         kind = type(content).__name__
-        raise InputError(f"{path} holds a {kind} where a JSON object belongs: write the file again")
+        raise InputError(f"{source} holds a {kind} where a JSON object belongs: write the file again")
     return content
 
 
