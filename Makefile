@@ -22,7 +22,7 @@ PACKAGES := $(wildcard src/*/package.xml src/*/setup.py src/*/setup.cfg src/*/CM
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | while IFS="$$(printf '\t')" read -r name what; do printf '  make %-12s %s\n' "$$name" "$$what"; done
 
-setup: $(VENV)/.workspace $(if $(VIEW),$(VENV)/.view) ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter; VIEW=1 adds Open3D for pipeprog view)
+setup: $(VENV)/.workspace $(if $(VIEW),$(VENV)/.view) $(if $(FLEET),$(VENV)/.fleet) ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter; VIEW=1 adds Open3D for pipeprog view, FLEET=1 Dask for pipeprog fleet)
 
 $(VENV)/.home:
 	@$(SHELL) setup/check.sh "$(PYTHON)"
@@ -41,6 +41,11 @@ $(VENV)/.view: $(VENV)/.packages requirements-view.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-view.txt
 	@touch $@
 
+$(VENV)/.fleet: $(VENV)/.packages requirements-fleet.txt requirements-fleet-dev.txt
+	@echo "Installing Dask and the clients of object stores (another 150 MB) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-dev.txt -r requirements-fleet.txt -r requirements-fleet-dev.txt
+	@touch $@
+
 $(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(wildcard setup/tf2_msgs/* setup/tf2_msgs/msg/*) $(INTERFACES) $(PACKAGES)
 	@$(SHELL) setup/build.sh $(VENV)
 	@touch $@
@@ -49,7 +54,7 @@ demo: setup ## the recording in bags/ through the node graph, and its report
 	@$(BIN)/pipeprog replay bags/demo.mcap --boq bags/demo.boq.yaml --board bags/demo.board.yaml --out $(DEMO) --force
 	@$(BIN)/pipeprog report $(DEMO) --out $(DEMO)/report.html --force
 
-test: setup ## unit and integration tests
+test: setup $(VENV)/.fleet ## unit and integration tests
 	@$(BIN)/python -m pytest tests/unit tests/integration
 
 lint: setup ## ruff and mypy

@@ -62,6 +62,7 @@ FOLDERS = {
         "export": {"recording", "results"},
         "report": {"recording", "results"},
         "view": {"report", "results"},
+        "fleet": {"report", "results"},
         "playback": {"recording", "results"},
     },
 }
@@ -90,6 +91,10 @@ DEPENDENCIES = {
     "mcap_ros2": None,
     "open3d": None,
     "openpyxl": None,
+    "dask": None,
+    "distributed": None,
+    "fsspec": None,
+    "psutil": None,
     "plyfile": None,
     "pye57": None,
     "pycolmap": None,

@@ -64,12 +64,17 @@ def replay(
     camera_info_topic: Annotated[str | None, typer.Option(help="CameraInfo topic of that camera.")] = None,
     odometry_topic: Annotated[str | None, typer.Option(help="Odometry topic, where there are several.")] = None,
     imu_topic: Annotated[str | None, typer.Option(help="IMU topic, where there are several.")] = None,
+    progress: Annotated[
+        Path | None,
+        typer.Option("--progress", help="Keep a file at where the replay stands, for programs.", metavar="FILE.json"),
+    ] = None,
 ) -> None:
     """Run the node graph on a recording: keyframes, metric map, classified pipes, progress."""
     from pipeprog_bringup.playback.node_processes import require_ros
 
     require_ros()
     from pipeprog_bringup.console import print_progress, replay_bars
+    from pipeprog_bringup.playback.state_file import state_file
     from pipeprog_bringup.replay import Request
     from pipeprog_bringup.replay import replay as run
 
@@ -86,7 +91,7 @@ def replay(
         odometry_topic,
         imu_topic,
     )
-    with replay_bars() as report:
+    with replay_bars() as show, state_file(progress, show) as report:
         outcome = run(request, report)
     for note in outcome.notes + outcome.losses:
         _note(note)
@@ -95,6 +100,53 @@ def replay(
         f"{outcome.frames} frames considered, {outcome.registered} of {outcome.keyframes} keyframes registered, "
         f"{len(outcome.product.pipes)} pipes: {out / 'pipes.json'}"
     )
+
+
+@app.command(rich_help_panel="From recordings")
+def fleet(
+    recordings: Annotated[
+        list[str],
+        typer.Argument(
+            help="Files, folders, globs, addresses such as s3://..., or a fleet.yaml.", metavar="RECORDINGS"
+        ),
+    ],
+    out: Annotated[str, typer.Option("--out", help="Folder or address for the results.", metavar="URI")],
+    boq: Annotated[
+        str, typer.Option("--boq", help="Bill of quantities: the planned classes.", metavar="BOQ.yaml|csv|xlsx")
+    ] = "",
+    board: Annotated[str, typer.Option("--board", help="Target boards (YAML): the scale.", metavar="BOARD.yaml")] = "",
+    overrides: Set = None,
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", help="A Dask cluster; without, this machine.", metavar="tcp://HOST:8786")
+    ] = "",
+    cores: Annotated[int, typer.Option("--cores", help="Cores for each survey.", min=1, metavar="C")] = 2,
+) -> None:
+    """Survey many recordings at once; what has its results already is left as it is."""
+    from pipeprog_camera.errors import InputError
+
+    try:
+        from pipeprog_bringup.survey_fleet import Request, survey_fleet
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"pipeprog fleet needs packages that are not installed (there is no {error.name}): "
+            "`pip install pipeprog[fleet]`, or in the repository `make setup FLEET=1`"
+        ) from None
+    from pipeprog_bringup.console import FleetDisplay
+    from pipeprog_bringup.playback.node_processes import require_ros
+
+    if not scheduler:
+        require_ros()
+    request = Request(recordings, out, boq, board, overrides or (), scheduler, cores)
+    try:
+        with FleetDisplay() as display:
+            surveyed = survey_fleet(request, display)
+    except KeyboardInterrupt:
+        _note("Interrupted: what is done stays; the same command goes on with the rest.")
+        raise typer.Exit(130) from None
+    without = [row for row in surveyed.rows if row.survey is None]
+    _say(f"{len(surveyed.rows) - len(without)} of {len(surveyed.rows)} recordings surveyed: {surveyed.page}")
+    if without:
+        raise InputError(f"{len(without)} of {len(surveyed.rows)} recordings have no results: {surveyed.page} says why")
 
 
 @app.command(rich_help_panel="From recordings")

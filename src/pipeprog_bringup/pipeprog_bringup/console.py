@@ -6,17 +6,19 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from pipeprog_camera.outside_text import for_terminal
 
 if TYPE_CHECKING:
+    from pipeprog_bringup.fleet.task import Outcome
     from pipeprog_bringup.playback.session import State
     from pipeprog_detect.product.product import Product
 
@@ -66,6 +68,70 @@ def replay_bars() -> Iterator[Callable[[State], None]]:
             display.update(stage, description=state.stage)
 
         yield report
+
+
+class FleetDisplay:
+    """Context with a line for each recording that is being surveyed and one for all; lines that stay for what is done.
+
+    Of each: frames and keyframes, stage, time left while frames are played; in all: recordings done, time left.
+    """
+
+    def __init__(self) -> None:
+        self._progress = progress_display()
+        self._lines: dict[str, TaskID] = {}
+        self._started: dict[str, float] = {}
+        self._seconds: list[float] = []  # of the surveys that are done
+
+    def __enter__(self) -> FleetDisplay:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def begin(self, total: int, kept: int) -> None:
+        """How many recordings there are, and of how many the results are there."""
+        self._total = self._progress.add_task("recordings", total=total, completed=kept, detail=f"{kept}/{total}")
+
+    def tell(self, state: dict[str, Any]) -> None:
+        """Where one survey stands; without a stage it is over."""
+        if "lost" in state:
+            self._progress.console.print(_name(state["lost"]))
+            return
+        name = state["name"]
+        if not state["stage"]:
+            self._drop(name)
+            return
+        if name not in self._lines:
+            self._lines[name] = self._progress.add_task(for_terminal(name), total=None, detail="")
+            self._started[name] = time.monotonic()
+        frames, considered = state.get("frames"), state.get("considered", 0)
+        detail = state["stage"]
+        if frames:
+            detail = f"{considered}/{frames} frames, {state['registered']}/{state['keyframes']} keyframes, {detail}"
+            if 0 < considered < frames:
+                elapsed = time.monotonic() - self._started[name]
+                detail += f", {_minutes(elapsed * (frames - considered) / considered)} left"
+        self._progress.update(self._lines[name], total=frames, completed=considered, detail=detail)
+
+    def end(self, outcome: Outcome) -> None:
+        """What became of one."""
+        if name_started := self._started.pop(outcome.name, None):
+            self._seconds.append(time.monotonic() - name_started)
+        self._drop(outcome.name)
+        self._progress.advance(self._total)
+        total = self._progress.tasks[self._total]
+        detail = f"{total.completed:.0f}/{total.total:.0f}"
+        if self._seconds and not total.finished:
+            mean = sum(self._seconds) / len(self._seconds)
+            detail += f", {_minutes(mean * (total.remaining or 0.0) / max(1, len(self._lines)))} left"
+        self._progress.update(self._total, detail=detail)
+        words = ": ".join(filter(None, (outcome.state, outcome.reason)))
+        self._progress.console.print(_name(f"{outcome.name}: {words}"), soft_wrap=True)
+
+    def _drop(self, name: str) -> None:
+        if name in self._lines:
+            self._progress.remove_task(self._lines.pop(name))
 
 
 def print_progress(product: Product) -> None:
@@ -159,6 +225,10 @@ def _single_figures(figures: dict[str, Any]) -> list[tuple[str, float | None, st
             ("worst camera, similarity", figures["trajectory"]["max_similarity_mm"], ".2f", "mm"),
         ]
     return single
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
 def _name(name: str) -> Text:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -21,9 +22,10 @@ BOARDS = """boards:
 BOQ = "classes: [{name: DN65, outer_radius_mm: 36.5, planned_length_m: 3.0}]\n"
 
 
-def pipeprog(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def pipeprog(*arguments: str | Path, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "pipeprog_bringup.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=120, check=False)
+    known = {**os.environ, **environment}
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=known, timeout=120, check=False)
 
 
 @pytest.fixture
@@ -42,14 +44,36 @@ def folder(tmp_path: Path) -> Path:
 def test_help_names_every_command() -> None:
     result = pipeprog("--help")
     assert result.returncode == 0
-    for command in ("replay", "detect", "ingest", "board", "score", "report"):
+    for command in ("replay", "detect", "ingest", "board", "score", "report", "fleet"):
         assert command in result.stdout
+
+
+def test_fleet_without_its_packages_says_how_to_get_them(tmp_path: Path) -> None:
+    (tmp_path / "dask").mkdir()
+    (tmp_path / "dask" / "__init__.py").write_text("raise ModuleNotFoundError(\"No module named 'dask'\", name='dask')")
+    result = pipeprog("fleet", "a.mcap", "--out", str(tmp_path / "out"), PYTHONPATH=str(tmp_path))
+    assert result.returncode == 1
+    assert "there is no dask" in result.stderr
+    assert "pip install pipeprog[fleet]" in result.stderr
 
 
 def test_help_is_instant_since_it_imports_nothing_heavy() -> None:
     code = "import sys, pipeprog_bringup.cli; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    heavy = {"numpy", "cv2", "rclpy", "scipy", "sklearn", "numba", "matplotlib", "mcap", "open3d", "jinja2", "yaml"}
+    heavy = {
+        "numpy",
+        "cv2",
+        "rclpy",
+        "scipy",
+        "sklearn",
+        "numba",
+        "matplotlib",
+        "mcap",
+        "open3d",
+        "jinja2",
+        "yaml",
+        "dask",
+    }
     assert not heavy & set(modules)
     assert len(modules) < 400, "the interpreter and typer load some 150"
 
