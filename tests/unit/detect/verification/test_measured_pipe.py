@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.types import Cylinder
@@ -43,3 +45,42 @@ def test_pieces_are_one_pipe_where_nothing_is_seen_between_them() -> None:
     assert len(joined([left, right], whole)) == 1
     assert len(joined([left, right], gap)) == 2
     assert len(joined([left, thicker], whole)) == 2
+
+
+def in_line(gap: float, offset: float, first: float, second: float) -> list[MeasuredPipe]:
+    """Two pipes along x with a gap [m] about 0, the second one `offset` [m] higher, of two radii [m]."""
+
+    def measured(low: float, high: float, height: float, radius: float) -> MeasuredPipe:
+        cylinder = Cylinder(np.array([low, 0.0, height]), np.array([high, 0.0, height]), radius)
+        evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
+        return MeasuredPipe(Candidate(cylinder, 2e-4, 100, evidence), cylinder, 2e-4)
+
+    return [measured(-HALF, -0.5 * gap, 0.0, first), measured(0.5 * gap, HALF, offset, second)]
+
+
+SIZES = st.sampled_from([0.0365, 0.0575, 0.0841, 0.1095, 0.1223])
+
+
+@given(gap=st.floats(0.02, 0.5), offset=st.floats(0.0, 0.04), first=SIZES, second=SIZES)
+@settings(max_examples=50, deadline=None)
+def test_pipes_in_line_of_two_radii_or_two_axes_are_two(gap: float, offset: float, first: float, second: float) -> None:
+    """Whatever hides the gap between them: an axis leaves the other one by a quarter of the radius and 4 mm."""
+    assume(first != second or offset > 0.25 * first + 4e-3)
+    assert len(joined(in_line(gap, offset, first, second), [])) == 2
+
+
+@given(gap=st.floats(0.1, 0.5), radius=st.sampled_from([0.0365, 0.0575]))
+@settings(max_examples=5, deadline=None)
+def test_a_gap_of_one_radius_parts_what_the_views_see_through(gap: float, radius: float) -> None:
+    pieces = in_line(gap, 0.0, radius, radius)
+    tubes = [tube(-HALF, -0.5 * gap, radius), tube(0.5 * gap, HALF, radius)]
+    assert len(joined(pieces, seen(*tubes))) == 2
+    assert len(joined(pieces, seen(*tubes)[:2])) == 1, "two views are too few"
+
+
+@given(gap=st.floats(0.05, 0.29))
+@settings(max_examples=4, deadline=None)
+def test_pieces_beside_what_hides_the_gap_are_one(gap: float) -> None:
+    before = np.random.default_rng(0).uniform([-0.3, -0.25, -0.3], [0.3, -0.2, 0.3], (60_000, 3))
+    tubes = [tube(-HALF, -0.5 * gap, 0.0365), tube(0.5 * gap, HALF, 0.0365)]
+    assert len(joined(in_line(gap, 0.0, 0.0365, 0.0365), seen(*tubes, before))) == 1
