@@ -142,39 +142,45 @@ def work(
     answered: Iterable[AddKeyframe | Retire],
     clock: Callable[[], float] = time.monotonic,
 ) -> None:
-    """As `serve`; a map is requested after `map_interval` keyframes, or IDLE_SECONDS without a command; None: never."""
+    """As `serve`; `clock` tells seconds.
+
+    A map is requested after `map_interval` keyframes, and one of all there is when no command has come for
+    IDLE_SECONDS; with None, no map but the last.
+    """
     for earlier in answered:
         _answer(reconstruction, earlier)
         reconstruction.update_dense()
     channel.send(Ready())
-    since_map, idle_since = 0, clock()
+    since_map, settled, idle_since = 0, True, clock()
     while True:
-        busy = map_interval is not None and (since_map > 0 or reconstruction.is_mapping)
-        if channel.poll(POLL_SECONDS if busy else None):
+        busy = map_interval is not None and (not settled or reconstruction.is_mapping)
+        came = channel.poll(POLL_SECONDS if busy else None)
+        if came:
             command = channel.recv()
             if isinstance(command, Finish):
                 reconstruction.move(command.motion)
                 channel.send(_finish(channel, reconstruction, command.colmap))
-                since_map = 0  # another map after the last one would have a stamp that no pipes have
+                since_map, settled = 0, True  # a map after the last one would have a stamp that no pipes have
                 continue
             channel.send(_answer(reconstruction, command))
             if isinstance(command, AddKeyframe):
                 reconstruction.update_dense()  # once the pose is out
-                since_map += 1
+                since_map, settled = since_map + 1, False
             idle_since = clock()
         if map_interval is None:
             continue
         try:
             metric_map = reconstruction.finished_map()
         except NotMetricError:
-            metric_map, since_map = None, max(since_map, 1)
+            metric_map, since_map = None, map_interval
         if metric_map is not None:
             channel.send(MapReady(reconstruction.status(), metric_map))
-        idle = since_map > 0 and clock() - idle_since > IDLE_SECONDS
-        if not reconstruction.is_mapping and (since_map >= map_interval or idle):
-            since_map = 0
-            with contextlib.suppress(NotMetricError):  # the status says why
-                reconstruction.request_map(settled=idle)
+        idle = not settled and clock() - idle_since > IDLE_SECONDS
+        if not reconstruction.is_mapping and ((came and since_map >= map_interval) or idle):
+            settled = idle
+            with contextlib.suppress(NotMetricError):  # the status says why, the next keyframe may measure the scale
+                reconstruction.request_map(settled)
+                since_map = 0
 
 
 def _answer(reconstruction: Reconstruction, command: AddKeyframe | Retire) -> KeyframeDone | Retired:

@@ -9,6 +9,7 @@ import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm import worker
+from pipeprog_sfm.reconstruction import NotMetricError
 from pipeprog_sfm.worker import IDLE_SECONDS, POLL_SECONDS
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -19,10 +20,11 @@ MAP_INTERVAL = 3
 class Prompt:
     """Stands for a Reconstruction whose maps are there as soon as they are asked for."""
 
-    def __init__(self) -> None:
+    def __init__(self, metric_after: int = 0) -> None:
         self.is_mapping = False
         self.keyframes: list[int] = []
         self.settled = False
+        self.metric_after = metric_after  # keyframes
 
     def add(self, stamp: int, *keyframe: object) -> None:
         self.keyframes.append(stamp)
@@ -46,6 +48,8 @@ class Prompt:
         return []
 
     def request_map(self, settled: bool) -> None:
+        if len(self.keyframes) < self.metric_after:
+            raise NotMetricError
         self.is_mapping, self.settled = True, settled
 
     def finished_map(self) -> str | None:
@@ -91,11 +95,12 @@ def events(
     *steps: worker.Command | float,
     answered: tuple[worker.AddKeyframe, ...] = (),
     map_interval: int | None = MAP_INTERVAL,
+    metric_after: int = 0,
 ) -> list[Any]:
     """What the loop sends until the connection closes."""
     script = Script(*steps)
     with pytest.raises(EOFError):
-        worker.work(script, cast(Any, Prompt()), map_interval, answered, lambda: script.now)
+        worker.work(script, cast(Any, Prompt(metric_after)), map_interval, answered, lambda: script.now)
     return script.events
 
 
@@ -122,6 +127,22 @@ def test_a_map_comes_after_each_interval_of_keyframes() -> None:
     done = [worker.KeyframeDone] * MAP_INTERVAL
     assert [type(event) for event in sent] == [worker.Ready, *done, worker.KeyframeDone, worker.MapReady]
     assert sent[-1].map == "early map"
+
+
+def test_the_first_map_comes_with_the_keyframe_that_measures_the_scale() -> None:
+    sent = events(*[KEYFRAME] * (MAP_INTERVAL + 2), metric_after=MAP_INTERVAL + 1)
+    assert [type(event) for event in sent[-2:]] == [worker.KeyframeDone, worker.MapReady]
+    assert len(sent) == 1 + MAP_INTERVAL + 2 + 1
+
+
+def test_after_a_map_at_the_last_keyframe_comes_one_of_all_there_is() -> None:
+    sent = events(*[KEYFRAME] * MAP_INTERVAL, 10 * IDLE_SECONDS)
+    assert [event.map for event in sent[1 + MAP_INTERVAL :]] == ["early map", "settled map"]
+
+
+def test_a_camera_at_rest_without_a_scale_is_not_asked_again() -> None:
+    sent = events(KEYFRAME, 10 * IDLE_SECONDS, metric_after=2)
+    assert [type(event) for event in sent] == [worker.Ready, worker.KeyframeDone]
 
 
 def test_without_an_interval_the_last_map_is_the_only_one() -> None:
