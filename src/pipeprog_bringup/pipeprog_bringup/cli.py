@@ -27,7 +27,7 @@ app = typer.Typer(
 )
 
 Boq = Annotated[
-    Path, typer.Option("--boq", help="Bill of quantities: the planned classes.", metavar="BOQ.yaml|csv|xlsx")
+    Path, typer.Option("--boq", help="Bill of quantities: the planned classes.", metavar="BOQ.yaml|csv|xlsx|ifc")
 ]
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.", metavar="DIR")]
 Force = Annotated[bool, typer.Option("--force", help="Replace the results that --out holds.")]
@@ -288,7 +288,7 @@ def view(
 @app.command(rich_help_panel="From results")
 def export(
     folder: Annotated[Path, typer.Argument(help="Results of a survey.", metavar="DIR")],
-    to: Annotated[list[str], typer.Option("--to", help="Format; may be repeated: xlsx, csv.", metavar="FORMAT")],
+    to: Annotated[list[str], typer.Option("--to", help="Format; may be repeated: xlsx, csv, ifc.", metavar="FORMAT")],
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the files; without, DIR/export.", metavar="FOLDER")
     ] = None,

@@ -11,6 +11,7 @@ from pathlib import Path
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import read_cloud
+from pipeprog_bringup.results.plan_file import write_plan
 from pipeprog_bringup.results.setting_overrides import effective
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -62,6 +63,8 @@ def _write(
     timings: dict[str, float],
 ) -> None:
     result_files.write_pipes(folder.file("pipes.json"), detection.product, SCALE)
+    if boq.pipes:
+        write_plan(folder.file("plan.json"), boq.pipes)
     result_files.write_progress(folder.file("progress.csv"), detection.product)
     result_files.write_config(
         folder.file("config.yaml"), {"detect": dataclasses.asdict(config), "boq": result_files.boq_entries(boq)}

@@ -22,6 +22,7 @@ from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.plan_file import write_plan
 from pipeprog_bringup.results.setting_overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
@@ -93,6 +94,8 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             notes=inputs.bag.notes,
             losses=inputs.bag.losses + session.log.faults(),
         )
+        if inputs.boq.pipes:
+            write_plan(folder.file("plan.json"), inputs.boq.pipes)
         result_files.write_config(folder.file("config.yaml"), _settings(request, inputs))
         timings = {**session.timings, "write": time.monotonic() - started}
         result_files.write_run(folder, _facts(request, inputs, outcome, timings))

@@ -58,6 +58,7 @@ MAX_BILL_COLUMNS = 256  # of a table; a bill has twenty
 MAX_SHEETS = 32  # of a workbook that are looked through; a project's bill has one for each trade
 MAX_XLSX = 16 << 20  # bytes of a workbook; MAX_BILL_ROWS of 20 columns take 1 MB
 MAX_XLSX_CONTENT = 64 << 20  # bytes that a workbook inflates to; tables inflate tenfold, openpyxl reads 8 MB a second
+MAX_IFC = 256 << 20  # bytes of a plan; a hospital's pipes take 60 MB, and IfcOpenShell ten times that in memory
 MAX_PIPE_RADIUS = 50.0  # m; tunnels have 9
 MIN_PIPE_RADIUS = 1e-4  # m; capillaries have 0.5 mm, and no camera sees them as pipes
 MAX_PIPE_LENGTH = 1e7  # m of one class; the Earth's quarter

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeprog_bringup.export.csv_tables import write_classes, write_pipes
+from pipeprog_bringup.export.ifc import write_ifc
 from pipeprog_bringup.export.survey import Survey, read_survey
 from pipeprog_bringup.export.xlsx import write_xlsx
 from pipeprog_bringup.results.atomic_output import output_file
@@ -26,6 +27,7 @@ class Format:
 
 FORMATS = {
     "xlsx": Format({"survey.xlsx": write_xlsx}),
+    "ifc": Format({"survey.ifc": write_ifc}),
     "csv": Format({"classes.csv": write_classes, "pipes.csv": write_pipes}),
 }
 

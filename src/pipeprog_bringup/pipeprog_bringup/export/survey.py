@@ -3,13 +3,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pipeprog_bringup.results.plan_file import read_plan
 from pipeprog_bringup.results.results_reader import Results, read_results
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.product.installed_where_planned import FoundPipe, PlannedState, installed_where_planned
 from pipeprog_detect.types import Cylinder
+
+_FAR = 10_000.0  # m; beyond, numbers of single precision are 1 mm apart and more
 
 
 @dataclass(frozen=True)
@@ -46,18 +53,43 @@ class BillLineRow:
 
 
 @dataclass(frozen=True)
+class Site:
+    """The coordinates that results are exported in.
+
+    Attributes:
+        site_from_map: (4, 4) rigid transform.
+        crs: name of the coordinate reference system, such as `EPSG:25832`; empty where none is given.
+    """
+
+    site_from_map: FloatArray = field(default_factory=lambda: np.eye(4))
+    crs: str = ""
+
+    @property
+    def origin(self) -> FloatArray:
+        """(3,) whole hundreds of metres that formats with single precision take off; 0 near the origin."""
+        place = self.site_from_map[:3, 3]
+        return np.round(place, -2) if np.abs(place).max() > _FAR else np.zeros(3)
+
+    def place(self, points: FloatArray) -> FloatArray:
+        """Points (N, 3) of the map in site coordinates [m]."""
+        return points @ self.site_from_map[:3, :3].T + self.site_from_map[:3, 3]
+
+
+@dataclass(frozen=True)
 class Survey:
-    """The results of a run."""
+    """The results of a run, and the coordinates to export them in."""
 
     results: Results
+    site: Site = Site()
 
     @cached_property
     def pipes(self) -> list[SurveyPipe]:
         """The pipes, in the order of pipes.json."""
         run_of = {pipe: str(run.get("id", "")) for run in self.results.runs for pipe in _texts(run.get("pipes"))}
+        places = (self.site.place(np.array([one.start, one.end])) for one in self.results.cylinders)
         return [
-            SurveyPipe(row, cylinder, run_of.get(row["id"], ""))
-            for row, cylinder in zip(self.results.pipes, self.results.cylinders, strict=True)
+            SurveyPipe(row, Cylinder(start, end, float(row["radius"])), run_of.get(row["id"], ""))
+            for row, (start, end) in zip(self.results.pipes, places, strict=True)
         ]
 
     @cached_property
@@ -74,6 +106,18 @@ class Survey:
             for line in told.get(name) or [{"name": name, "planned_length_m": row["planned_m"]}]:
                 rows.append(_line(name, line))
         return rows
+
+    @cached_property
+    def planned(self) -> list[PlannedState]:
+        """What was found of each planned pipe; empty where the plan has no places.
+
+        Plan and results are compared in site coordinates; without control points, these are those of the map.
+        """
+        path = self.results.folder / "plan.json"
+        if not path.is_file():
+            return []
+        found = [FoundPipe(pipe.id, pipe.cylinder, pipe.class_name) for pipe in self.pipes]
+        return installed_where_planned(read_plan(path), found)
 
     @property
     def finished(self) -> str:

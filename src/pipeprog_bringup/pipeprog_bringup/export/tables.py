@@ -42,19 +42,32 @@ def class_rows(survey: Survey) -> list[ClassRow]:
     ]
 
 
-def activity_shares(survey: Survey) -> dict[str, float]:
-    """Installed share, 0 to 1, of each activity whose metres are known: those of classes with one line.
+def line_lengths(survey: Survey, row: ClassRow) -> list[float | None]:
+    """Installed metres of each line of a class; None where its lines are told together, by nothing told apart.
 
-    The metres of a class with several lines are told together, so no share is given for what these belong to.
+    A class of one line has the metres of the class. Those of several are told apart by their places in the plan.
     """
+    if len(row.lines) == 1:
+        return [row.installed]
+    if not survey.planned:
+        return [None] * len(row.lines)
+    lengths = [0.0] * len(row.lines)
+    for state in survey.planned:
+        if state.planned.class_name == row.name and 0 <= state.planned.line < len(lengths):
+            lengths[state.planned.line] += state.length
+    return list(lengths)
+
+
+def activity_shares(survey: Survey) -> dict[str, float]:
+    """Installed share, 0 to 1, of each activity whose metres are known, all of them."""
     planned: dict[str, float] = {}
     installed: dict[str, float] = {}
     unknown = set()
     for row in class_rows(survey):
-        for line in row.lines:
+        for line, length in zip(row.lines, line_lengths(survey, row), strict=True):
             planned[line.activity] = planned.get(line.activity, 0.0) + line.planned
-            installed[line.activity] = installed.get(line.activity, 0.0) + row.installed
-            if len(row.lines) > 1:
+            installed[line.activity] = installed.get(line.activity, 0.0) + (length or 0.0)
+            if length is None:
                 unknown.add(line.activity)
     return {
         name: min(installed[name] / length, 1.0)

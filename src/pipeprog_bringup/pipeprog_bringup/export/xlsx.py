@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A workbook: sheets Progress, Pipes, and TASK for schedules; numbers are numbers, so every locale shows its own."""
+"""A workbook: sheets Progress, Pipes, Planned, Not seen, TASK; numbers are numbers, so every locale shows its own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from pipeprog_bringup.export.survey import BillLineRow, Survey, SurveyPipe
-from pipeprog_bringup.export.tables import activity_shares, class_rows, positive
+from pipeprog_bringup.export.tables import activity_shares, class_rows, line_lengths, positive
+from pipeprog_detect.product.boq import PlannedPipe
+from pipeprog_detect.product.installed_where_planned import PlannedState
 
 # What a workbook says of when it was made; a fixed day, so that the same results give the same bytes.
 _CREATED = datetime(2000, 1, 1)
@@ -51,13 +53,31 @@ _PIPES = (
     _Column("Visible arc [deg]", _WHOLE, 16),
     _Column("Points", _WHOLE),
 )
+_PLANNED = (
+    _Column("Planned pipe", width=28),
+    _Column("Class", width=28),
+    _Column("State", width=12),
+    _Column("Planned [m]", _METRES),
+    _Column("Installed [m]", _METRES, 13),
+    _Column("Off the axis [mm]", _MILLIMETRES, 17),
+    _Column("Shifted along [mm]", _MILLIMETRES, 18),
+    _Column("Found as", width=16),
+    _Column("GUID in the plan", width=26),
+)
+_NOT_SEEN = (
+    _Column("Planned pipe", width=28),
+    _Column("Class", width=28),
+    _Column("Planned [m]", _METRES),
+    *(_Column(f"{end} {axis} [m]", _METRES) for end in ("Start", "End") for axis in "xyz"),
+    _Column("GUID in the plan", width=26),
+)
 # Field names of Primavera P6's spreadsheets, which take the first row, and the captions in the second.
 _TASK = (_Column("task_code", width=20), _Column("phys_complete_pct", "0.0", 20))
 _TASK_CAPTIONS = ("Activity ID", "Physical % Complete")
 
 
 def write_xlsx(survey: Survey, path: Path) -> None:
-    """Writes the workbook; the sheet TASK is there where the bill names activities."""
+    """Writes the workbook; Planned and Not seen need places in the plan, TASK activities in the bill."""
     import xlsxwriter
 
     book = xlsxwriter.Workbook(str(path), {"strings_to_formulas": False, "strings_to_urls": False})
@@ -73,6 +93,10 @@ def write_xlsx(survey: Survey, path: Path) -> None:
             {"type": "data_bar", "min_type": "num", "min_value": 0, "max_type": "num", "max_value": 1},
         )
     _write_sheet(book, "Pipes", _PIPES, [_pipe_row(pipe) for pipe in survey.pipes])
+    if survey.planned:
+        _write_sheet(book, "Planned", _PLANNED, [_planned_row(state) for state in survey.planned])
+        missing = [_not_seen_row(state.planned) for state in survey.planned if not state.found]
+        _write_sheet(book, "Not seen", _NOT_SEEN, missing)
     shares = activity_shares(survey)
     if shares:
         rows: list[list[Any]] = [[name, 100.0 * share] for name, share in sorted(shares.items())]
@@ -81,7 +105,7 @@ def write_xlsx(survey: Survey, path: Path) -> None:
 
 
 def _progress_rows(survey: Survey) -> list[list[Any]]:
-    """A row for each class; where it has several lines, a row for each of them below it, without installed metres."""
+    """A row for each class; where it has several lines, a row for each of them below it."""
     rows: list[list[Any]] = []
     for row in class_rows(survey):
         alone = len(row.lines) == 1
@@ -89,7 +113,8 @@ def _progress_rows(survey: Survey) -> list[list[Any]]:
         rows.append([*cells, *(_details(row.lines[0]) if alone else [])])
         if not alone:
             rows += [
-                [f"  {line.name}", None, line.planned, None, None, None, None, *_details(line)] for line in row.lines
+                [f"  {line.name}", None, line.planned, length, None, None, None, *_details(line)]
+                for line, length in zip(row.lines, line_lengths(survey, row), strict=True)
             ]
     return rows
 
@@ -113,6 +138,18 @@ def _pipe_row(pipe: SurveyPipe) -> list[Any]:
         row.get("visible_arc_deg"),
         row.get("points"),
     ]
+
+
+def _planned_row(state: PlannedState) -> list[Any]:
+    planned = state.planned
+    off: list[float | None] = [1e3 * state.across, 1e3 * state.along] if state.found else [None] * 2
+    cells = [planned.name, planned.class_name, state.state, planned.cylinder.length, state.length, *off]
+    return [*cells, ", ".join(state.found), planned.id]
+
+
+def _not_seen_row(planned: PlannedPipe) -> list[Any]:
+    place = map(float, (*planned.cylinder.start, *planned.cylinder.end))
+    return [planned.name, planned.class_name, planned.cylinder.length, *place, planned.id]
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.plan.csv_bill import csv_entries
 from pipeprog_detect.plan.entry import Entry
+from pipeprog_detect.plan.ifc_plan import ifc_entries
 from pipeprog_detect.plan.xlsx_bill import xlsx_entries
 from pipeprog_detect.plan.yaml_bill import yaml_entries
 
@@ -17,6 +18,7 @@ _READERS: dict[str, Callable[[Path], list[Entry]]] = {
     ".yml": yaml_entries,
     ".csv": csv_entries,
     ".xlsx": xlsx_entries,
+    ".ifc": ifc_entries,
 }
 
 

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plan in IFC: its straight pipes with their places, summed up to the lines of a bill of quantities.
+
+The one module of the plan that imports IfcOpenShell, which is an extra.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.errors import InputError
+from pipeprog_camera.limits import MAX_COORDINATE, MAX_IFC, MAX_NAME, MAX_PIPES
+from pipeprog_camera.text_file import require_regular
+from pipeprog_detect.plan.entry import Entry, Segment
+
+_INSTALL = "plans in IFC need IfcOpenShell: `pip install ifcopenshell==0.9.0.post1` (or `make setup EXCHANGE=1`)"
+_NESTED = 8  # mapped items within each other; exporters write one
+_STEP = 1e-5  # m to which outer radii are rounded: sizes of one class differ by less in files of single precision
+# Of a mesh, the principal axis is that of the pipe where it is this much longer than wide.
+_SLENDER = 2.0
+
+
+@dataclass(frozen=True)
+class _Straight:
+    """A planned pipe: its segment, its outer radius [m], and what it belongs to."""
+
+    segment: Segment
+    radius: float
+    type_name: str
+    place: tuple[str, str, str]  # system, zone, activity
+    days: tuple[str, str]  # planned start and finish, ISO dates or empty
+
+
+def ifc_entries(path: Path) -> list[Entry]:
+    """The pipes of an IFC file as entries of a bill, one for each size in each system, zone and activity.
+
+    Raises InputError where it is none, holds no straight pipe with a place, or IfcOpenShell is not installed.
+    """
+    require_regular(path)
+    if path.stat().st_size > MAX_IFC:
+        raise InputError(f"{path} is larger than {MAX_IFC >> 20} MiB: export the pipes' discipline alone")
+    try:
+        import ifcopenshell
+    except ImportError:
+        raise InputError(f"{path}: {_INSTALL}") from None
+    try:
+        straights = _straights(ifcopenshell.open(str(path)))
+    except MemoryError:
+        raise InputError(f"{path} does not fit into memory: export the pipes' discipline alone") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    # IfcOpenShell raises exceptions of any type for files that break the schema.
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+        raise InputError(f"{path} cannot be read as IFC ({reason}): export it again as IFC4") from None
+    if not straights:
+        raise InputError(f"{path} holds no straight pipe (IfcPipeSegment with a round body): export pipes as solids")
+    return _entries(str(path), straights)
+
+
+def _entries(path: str, straights: Sequence[_Straight]) -> list[Entry]:
+    groups: dict[tuple[float, tuple[str, str, str]], list[_Straight]] = {}
+    radii: dict[str, set[float]] = {}
+    for one in straights:
+        groups.setdefault((one.radius, one.place), []).append(one)
+        radii.setdefault(one.type_name, set()).add(one.radius)
+    entries = []
+    for (radius, place), group in groups.items():
+        values: dict[str, object] = {
+            "name": _group_name(radius, group, radii),
+            "outer_radius_mm": round(1e3 * radius, 6),
+            "planned_length_m": round(sum(float(np.linalg.norm(o.segment.end - o.segment.start)) for o in group), 6),
+        }
+        starts, finishes = ([day for day in days if day] for days in zip(*(one.days for one in group), strict=True))
+        texts = dict(zip(("system", "zone", "activity"), place, strict=True))
+        texts |= {"start": min(starts, default=""), "finish": max(finishes, default="")}
+        values |= {key: text for key, text in texts.items() if text}
+        entries.append(Entry(path, values, tuple(one.segment for one in group)))
+    return entries
+
+
+def _group_name(radius: float, group: Sequence[_Straight], radii: dict[str, set[float]]) -> str:
+    """Names of the pipes' types; with the size where a type has several, or none has a name."""
+    names = sorted({one.type_name for one in group if one.type_name})
+    size = f"{2e3 * radius:g} mm"
+    if not names:
+        return size
+    text = " + ".join(name if len(radii[name]) == 1 else f"{name} {size}" for name in names)
+    return text if len(text) <= MAX_NAME // 2 else f"{names[0][: MAX_NAME // 4]} {size}"
+
+
+def _straights(model: Any) -> list[_Straight]:
+    from ifcopenshell.util.unit import calculate_unit_scale
+
+    scale = float(calculate_unit_scale(model))  # metres in a unit of the file
+    elements = model.by_type("IfcFlowSegment" if model.schema == "IFC2X3" else "IfcPipeSegment")
+    if len(elements) > MAX_PIPES:
+        raise InputError(f"{len(elements)} pipes: plan {MAX_PIPES} at most, or export it storey by storey")
+    found = []
+    for element in elements:
+        place = _place(element, scale)
+        if place is None:
+            continue
+        start, end, radius = place
+        if not (np.abs([*start, *end, radius]) <= MAX_COORDINATE).all():
+            raise InputError(f"pipe {element.GlobalId} lies beyond all coordinates: export the plan again")
+        if np.linalg.norm(end - start) > 0.0 < radius:
+            segment = Segment(str(element.GlobalId), _text(element.Name), start, end)
+            rounded = round(round(radius / _STEP) * _STEP, 9)
+            found.append(_Straight(segment, rounded, _type_name(element), _belongs_to(element), _days(element)))
+    return found
+
+
+def _place(element: Any, scale: float) -> tuple[FloatArray, FloatArray, float] | None:
+    """Ends of the axis and outer radius [m] of a pipe, None where it is not a straight one."""
+    from ifcopenshell.util.placement import get_local_placement
+
+    if element.Representation is None:
+        return None
+    bodies = [one for one in element.Representation.Representations if one.RepresentationIdentifier in ("Body", None)]
+    world = np.asarray(get_local_placement(element.ObjectPlacement), float)
+    for representation in bodies:
+        for item, item_to_object in _items(representation, np.eye(4), 0):
+            ends = _axis(item)
+            if ends is not None:
+                points, radius = ends
+                placed = world @ item_to_object
+                moved = points @ placed[:3, :3].T + placed[:3, 3]
+                grown = float(np.linalg.norm(placed[:3, 0]))
+                return scale * moved[0], scale * moved[1], scale * radius * grown
+    return _from_mesh(element) if bodies else None
+
+
+def _items(representation: Any, to_object: FloatArray, depth: int) -> Iterator[tuple[Any, FloatArray]]:
+    """The solids of a representation, mapped ones with their transform."""
+    from ifcopenshell.util.placement import get_mappeditem_transformation
+
+    for item in representation.Items:
+        if item.is_a("IfcMappedItem"):
+            if depth < _NESTED:
+                matrix = to_object @ np.asarray(get_mappeditem_transformation(item), float)
+                yield from _items(item.MappingSource.MappedRepresentation, matrix, depth + 1)
+        else:
+            yield item, to_object
+
+
+def _axis(item: Any) -> tuple[FloatArray, float] | None:
+    """Ends of the axis (2, 3) and outer radius of a solid in its own units; None where it is no straight round one."""
+    from ifcopenshell.util.placement import get_axis2placement
+
+    if item.is_a("IfcExtrudedAreaSolid") and item.SweptArea.is_a("IfcCircleProfileDef"):
+        centre = np.zeros(3)
+        position = item.SweptArea.Position
+        if position is not None:
+            centre[:2] = position.Location.Coordinates[:2]
+        direction = np.asarray(item.ExtrudedDirection.DirectionRatios, float)
+        way = item.Depth * direction / np.linalg.norm(direction)
+        matrix = np.eye(4) if item.Position is None else np.asarray(get_axis2placement(item.Position), float)
+        points = np.array([centre, centre + way]) @ matrix[:3, :3].T + matrix[:3, 3]
+        return points, float(item.SweptArea.Radius)
+    if item.is_a("IfcSweptDiskSolid") and item.Directrix.is_a("IfcPolyline") and len(item.Directrix.Points) == 2:
+        return np.array([point.Coordinates for point in item.Directrix.Points], float), float(item.Radius)
+    return None
+
+
+def _from_mesh(element: Any) -> tuple[FloatArray, FloatArray, float] | None:
+    """A cylinder through the vertices of a body of another kind [m]; None where it is not a slender one."""
+    import ifcopenshell.geom
+
+    settings = ifcopenshell.geom.settings()
+    settings.set("use-world-coords", True)
+    try:
+        shape = ifcopenshell.geom.create_shape(settings, element)
+    except RuntimeError:
+        return None
+    vertices = np.unique(np.round(np.asarray(shape.geometry.verts, float).reshape(-1, 3), 6), axis=0)
+    if len(vertices) < 6:
+        return None
+    centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    axis = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2][0]
+    along = (vertices - centre) @ axis
+    across = np.linalg.norm(vertices - centre - along[:, None] * axis, axis=1)
+    if np.ptp(along) < _SLENDER * 2.0 * across.max():
+        return None
+    return centre + along.min() * axis, centre + along.max() * axis, float(across.max())
+
+
+def _belongs_to(element: Any) -> tuple[str, str, str]:
+    """System, zone (the storey or space that contains it) and activity, empty where the plan does not tell."""
+    from ifcopenshell.util.element import get_container
+
+    groups = [rel.RelatingGroup for rel in element.HasAssignments if rel.is_a("IfcRelAssignsToGroup")]
+    systems = sorted(_text(group.Name) for group in groups if group.is_a("IfcSystem") and not group.is_a("IfcZone"))
+    container = get_container(element)
+    zone = "" if container is None else _text(container.Name)
+    activities = sorted(_text(getattr(task, "Identification", None) or task.Name) for task in _tasks(element))
+    return " + ".join(systems)[:MAX_NAME], zone, activities[0] if activities else ""
+
+
+def _days(element: Any) -> tuple[str, str]:
+    times = [task.TaskTime for task in _tasks(element) if getattr(task, "TaskTime", None) is not None]
+    starts = [str(time.ScheduleStart)[:10] for time in times if time.ScheduleStart]
+    finishes = [str(time.ScheduleFinish)[:10] for time in times if time.ScheduleFinish]
+    return min(starts, default=""), max(finishes, default="")
+
+
+def _tasks(element: Any) -> list[Any]:
+    relations = [
+        *(rel for rel in element.HasAssignments if rel.is_a("IfcRelAssignsToProcess")),
+        *getattr(element, "ReferencedBy", ()),
+    ]
+    processes = [rel.RelatingProcess for rel in relations if rel.is_a("IfcRelAssignsToProcess")]
+    outputs = [task for rel in relations if rel.is_a("IfcRelAssignsToProduct") for task in rel.RelatedObjects]
+    return [task for task in (*processes, *outputs) if task.is_a("IfcTask")]
+
+
+def _type_name(element: Any) -> str:
+    from ifcopenshell.util.element import get_type
+
+    kind = get_type(element)
+    return _text(kind.Name if kind is not None and kind.Name else element.ObjectType)
+
+
+def _text(value: Any) -> str:
+    """A name of the file on one line; empty for none."""
+    return " ".join(str(value or "").split())[: MAX_NAME // 2]
