@@ -11,24 +11,8 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.product import fittings
 from pipeprog_detect.types import Cylinder, Pipe
-
-# Axes that a fitting joins meet within 0.3 radii, and 5 mm by which their measurement may be off; over the gap of a
-# coupling also 3 % of its length, as directions of short pipes are off by up to 1.7 deg.
-_MISS, _LEAST_MISS = 0.3, 5e-3
-_MISS_SLOPE = 0.03
-# A turn [rad] below 8 deg is a coupling's, not an elbow's; no fitting turns by more than 135 deg. A branch leaves its
-# run at 45 deg or more; 30 deg leaves room for what its axis may be off by.
-_STRAIGHT, _SHARPEST = np.radians(8.0), np.radians(135.0)
-_LEAST_BRANCHING = np.radians(30.0)
-# Bends turn about up to five diameters (10 radii); their sockets add up to a diameter (2 radii). Radii of one size
-# agree within 25 %, the step between standard sizes.
-_WIDEST_BEND, _SOCKET = 10.0, 2.0
-_SAME_SIZE = 1.25
-# Ends measured too long overlap: in a coupling by a radius at most, in an elbow up to half a radius beyond the corner.
-_OVERLAP, _CORNER_OVERLAP = 1.0, 0.5
-# A reducer or a coupling hides at most 10 radii of the thicker pipe, or 0.3 m.
-_COUPLING, _LEAST_COUPLING = 10.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -36,13 +20,14 @@ class Joint:
     """A fitting between the pipes with these ids; angle [rad] of its turn, length [m] along the centre line.
 
     kind is "elbow", "reducer", "coupling" or "tee"; of a tee the first pipe is the branch, whose centre line reaches
-    the other's axis.
+    the other's axis. `miss` is how far the axes pass each other [m], NaN where it is not known.
     """
 
     kind: str
     pipes: tuple[str, str]
     angle: float
     length: float
+    miss: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -108,35 +93,27 @@ def _end(cylinder: Cylinder, which: int) -> tuple[FloatArray, FloatArray]:
 
 def _between_ends(first: Pipe, second: Pipe, a: int, b: int) -> tuple[float, Joint] | None:
     """The gap between the axes [m], and the elbow, reducer or coupling between two ends."""
-    one, other = first.cylinder, second.cylinder
-    ids = (first.id, second.id)
-    (from_, out), (to, back) = _end(one, a), _end(other, b)
-    thick, thin = max(one.radius, other.radius), min(one.radius, other.radius)
-    allowed = _MISS * thin + _LEAST_MISS
+    (from_, out), (to, back) = _end(first.cylinder, a), _end(second.cylinder, b)
     turn = float(np.arccos(np.clip(-(out @ back), -1.0, 1.0)))
-    if turn < _STRAIGHT:
+    thick, thin = (sort(pipe.cylinder.radius for pipe in (first, second)) for sort in (max, min))
+    same = fittings.are_of_one_size(first, second)
+    ids = (first.id, second.id)
+    if turn < fittings.STRAIGHT:
         gap = to - from_
         along = float(gap @ out)
         miss = float(np.linalg.norm(gap - along * out))
-        longest = max(_COUPLING * thick, _LEAST_COUPLING)
-        if not -_OVERLAP * thick < along < longest or miss > allowed + _MISS_SLOPE * abs(along):
+        fits = fittings.is_coupling(along, thick) if same else fittings.is_reducer(along, thick, thin)
+        if not fits or miss > fittings.miss_allowed(thin) + fittings.MISS_SLOPE * abs(along):
             return None
-        kind = "coupling" if thick < _SAME_SIZE * thin else "reducer"
-        return miss, Joint(kind, ids, turn, max(along, 0.0))
-    if turn > _SHARPEST or thick > _SAME_SIZE * thin:
+        return miss, Joint("coupling" if same else "reducer", ids, turn, max(along, 0.0), miss)
+    if not same or turn > fittings.SHARPEST:
         return None
     s, t, miss = _meeting(from_, out, to, back)
-    longest = _WIDEST_BEND * thick * np.tan(0.5 * turn) + _SOCKET * thick
-    if (
-        miss > allowed
-        or min(s, t) < -_CORNER_OVERLAP * thick
-        or max(s, t) > longest
-        or abs(s - t) > 2.0 * _SOCKET * thick
-    ):
+    if miss > fittings.miss_allowed(thin) or not fittings.is_elbow(s, t, turn, thick):
         return None
     # The bend begins where the nearer end is; what the other has more is straight socket.
     tangent = max(min(s, t), 0.0)
-    return miss, Joint("elbow", ids, turn, tangent * turn / float(np.tan(0.5 * turn)) + abs(s - t))
+    return miss, Joint("elbow", ids, turn, tangent * turn / float(np.tan(0.5 * turn)) + abs(s - t), miss)
 
 
 def _branch(first: Pipe, second: Pipe, a: int) -> tuple[float, Joint] | None:
@@ -144,13 +121,13 @@ def _branch(first: Pipe, second: Pipe, a: int) -> tuple[float, Joint] | None:
     branch, run = first.cylinder, second.cylinder
     end, out = _end(branch, a)
     turn = float(np.arccos(np.clip(abs(out @ run.axis), 0.0, 1.0)))
-    if turn < _LEAST_BRANCHING or branch.radius > _SAME_SIZE * run.radius:
+    if turn < fittings.STRAIGHT or not (branch.radius < run.radius or fittings.are_of_one_size(first, second)):
         return None
     s, t, miss = _meeting(end, out, run.start, run.axis)
-    reach = run.radius / float(np.sin(turn)) + _SOCKET * run.radius
-    if miss > _MISS * run.radius + _LEAST_MISS or not 0.0 < s < reach or not run.radius < t < run.length - run.radius:
+    on_barrel = run.radius < t < run.length - run.radius
+    if miss > fittings.miss_allowed(branch.radius) or not on_barrel or not fittings.is_tee(s, turn, run.radius):
         return None
-    return miss, Joint("tee", (first.id, second.id), turn, s)
+    return miss, Joint("tee", (first.id, second.id), turn, s, miss)
 
 
 def _meeting(one: FloatArray, out: FloatArray, other: FloatArray, back: FloatArray) -> tuple[float, float, float]:
