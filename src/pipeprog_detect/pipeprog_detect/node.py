@@ -324,7 +324,9 @@ def _run_msg(run: PipeRun) -> msg.PipeRun:
         barrel_length=run.barrel,
         centre_line_length=run.centre_line,
         joints=[
-            msg.PipeJoint(kind=joint.kind, pipes=list(joint.pipes), angle=joint.angle, length=joint.length)
+            msg.PipeJoint(
+                kind=joint.kind, pipes=list(joint.pipes), angle=joint.angle, length=joint.length, miss=joint.miss
+            )
             for joint in run.joints
         ],
     )

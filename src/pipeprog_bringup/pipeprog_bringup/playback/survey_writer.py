@@ -103,7 +103,9 @@ def _progress(message: msg.ClassProgress) -> ClassProgress:
 
 
 def _run(message: msg.PipeRun) -> PipeRun:
-    joints = tuple(Joint(joint.kind, (*joint.pipes,), joint.angle, joint.length) for joint in message.joints)
+    joints = tuple(
+        Joint(joint.kind, (*joint.pipes,), joint.angle, joint.length, joint.miss) for joint in message.joints
+    )
     return PipeRun(message.id, tuple(message.pipes), joints, message.barrel_length, message.centre_line_length)
 
 

@@ -21,6 +21,7 @@ from pipeprog_bringup.results.results_reader import Color
 STILL_WIDTH = 1000  # px: the width of the page
 STILL_QUALITY = 85  # of the JPEG
 AROUND_PIPES = 1.0  # m of the cloud shown around the pipes
+END_WORDS = {"fitting": "at a fitting", "wall": "at a wall", "out_of_view": "out of view"}  # of `state`
 NO_CLASS = "-"  # in the place of a letter
 HIDING_POINTS = 100_000  # of the cloud, to find what hides a pipe: one for each 25 mm of 60 m2 of wall
 
@@ -34,6 +35,7 @@ class PipeRow:
     color: Color
     run: str
     fittings: list[str]
+    ends: str
     photographs: list[Photograph]
 
 
@@ -111,6 +113,7 @@ def gather(surveys: Sequence[Survey], show: Callable[[float, str], None]) -> Con
                 color,
                 runs.get(pipe["id"], ""),
                 fittings.get(pipe["id"], []),
+                _ends(pipe),
                 own,
             )
             for pipe, color, own in zip(newest.pipes, colors, proofs, strict=True)
@@ -161,6 +164,15 @@ def _runs(survey: Survey) -> tuple[dict[str, str], dict[str, list[str]]]:
                 runs[one] = str(run.get("id", ""))
                 fittings.setdefault(one, []).append(f"{kind} to {other}")
     return runs, fittings
+
+
+def _ends(pipe: dict[str, Any]) -> str:
+    """What is at the start and the end of a pipe, in words; empty where the results do not say."""
+    ends = pipe.get("ends")
+    states = [str(end.get("state", "")) for end in ends if isinstance(end, dict)] if isinstance(ends, list) else []
+    if not states or set(states) == {"unknown"}:
+        return ""
+    return " and ".join(END_WORDS.get(state, state) for state in states)
 
 
 def _left_out(survey: Survey) -> list[str]:

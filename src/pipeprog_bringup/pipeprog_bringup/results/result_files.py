@@ -251,6 +251,7 @@ def _run_entry(run: PipeRun) -> dict[str, Any]:
                 "pipes": list(joint.pipes),
                 "angle_deg": round(float(np.degrees(joint.angle)), 1),
                 "length": round(joint.length, 6),
+                "miss": _significant(joint.miss),
             }
             for joint in run.joints
         ],

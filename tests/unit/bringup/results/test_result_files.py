@@ -129,7 +129,7 @@ def test_what_two_classes_explain_is_ambiguous(tmp_path: Path) -> None:
 
 
 def test_runs_and_their_joints(tmp_path: Path) -> None:
-    elbow = Joint("elbow", ("p03", "p04"), 0.5 * np.pi, 0.31415926)
+    elbow = Joint("elbow", ("p03", "p04"), 0.5 * np.pi, 0.31415926, 0.00123456)
     run = PipeRun("r07", ("p03", "p04"), (elbow,), 2.42, 2.73415926)
     result_files.write_pipes(tmp_path / "pipes.json", Product([PIPE, replace(PIPE, id="p04")], CLASSES, [run]), SCALE)
     assert json.loads((tmp_path / "pipes.json").read_text())["runs"] == [
@@ -138,7 +138,9 @@ def test_runs_and_their_joints(tmp_path: Path) -> None:
             "pipes": ["p03", "p04"],
             "barrel_length": 2.42,
             "centre_line_length": 2.734159,
-            "joints": [{"kind": "elbow", "pipes": ["p03", "p04"], "angle_deg": 90.0, "length": 0.314159}],
+            "joints": [
+                {"kind": "elbow", "pipes": ["p03", "p04"], "angle_deg": 90.0, "length": 0.314159, "miss": 0.001235}
+            ],
         }
     ]
 
