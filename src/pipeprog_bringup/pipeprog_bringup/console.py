@@ -195,14 +195,19 @@ def _errors_table(pipes: Sequence[dict[str, Any]]) -> Table:
     table = Table(title="Pipes", title_justify="left")
     for name in ("truth", "found", "class"):
         table.add_column(name)
-    for name in ("radius [mm]", "radius error [mm]", "length [m]", "length error [%]", "off axis [mm]"):
+    for name in (
+        *("radius [mm]", "radius error [mm]", "in sigmas", "length [m]", "length error [%]", "in sigmas"),
+        "off axis [mm]",
+    ):
         table.add_column(name, justify="right")
     for pipe in pipes:
         measures = (
             (1e3 * pipe["true_radius"], ".1f"),
             (pipe["radius_error_mm"], "+.3f"),
+            (pipe["radius_error_sigmas"], "+.1f"),
             (pipe["true_length"], ".3f"),
             (pipe["length_error_percent"], "+.2f"),
+            (pipe["length_error_sigmas"], "+.1f"),
             (pipe["axis_distance_mm"], ".1f"),
         )
         cells = (_number(value, form) for value, form in measures)
@@ -214,7 +219,9 @@ def _single_figures(figures: dict[str, Any]) -> list[tuple[str, float | None, st
     """Name, value (None: not known), format and unit of the figures that are no table."""
     single = [
         ("radius RMSE", figures["radius"]["rmse_mm"], ".3f", "mm"),
+        ("radius within 3 sigma", figures["radius"]["within_3_sigma"], ".3f", "of the pipes"),
         ("length error, mean", figures["length"]["mean_error_percent"], ".2f", "%"),
+        ("length within 3 sigma", figures["length"]["within_3_sigma"], ".3f", "of the pipes"),
         *((f"metres of {c['class']}", c["error_percent"], "+.2f", "%") for c in figures["length"]["per_class"]),
         ("scale error", figures["scale"]["error_percent"], "+.4f", "%"),
     ]

@@ -9,7 +9,7 @@ scored apart.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +34,18 @@ OVERLAP_MIN = 0.5
 IGNORE_ANGLE_MAX = np.radians(15.0)
 # A true radius belongs to the class within the tolerance of manufacture (1 % of the diameter, EN 10255).
 CLASS_TOLERANCE = 0.01
+# Of Gaussian errors 99.7 % lie within this many standard deviations.
+SIGMAS = 3.0
 # Stamps in trajectory.tum are seconds as decimals, which other tools round to milliseconds at worst.
 STAMP_TOLERANCE = 1_000_000  # ns
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A cylinder of the truth or of the result: ends (3,) [m], radius [m], length [m], id, class or None."""
+    """A cylinder of the truth or of the result: ends (3,) [m], radius [m], length [m], id, class or None.
+
+    `radius_sigma`, `length_sigma`: standard deviations [m], None where they are not known.
+    """
 
     start: FloatArray
     end: FloatArray
@@ -48,6 +53,8 @@ class Segment:
     length: float
     id: str
     class_name: str | None = None
+    radius_sigma: float | None = None
+    length_sigma: float | None = None
 
 
 @dataclass(frozen=True)
@@ -269,13 +276,13 @@ def _segment(entry: dict[str, Any], name: Any, where: str) -> Segment:
     if not isinstance(class_name, str | None):
         raise InputError(f"class of {where} is {shown(class_name)}, not a name")
     length = number({"length": distance, **entry}, "length", where)
-    return Segment(start, end, radius, length, name_of(name, f"id of {where}"), class_name)
+    sigmas = (None if entry.get(key) is None else number(entry, key, where) for key in ("radius_sigma", "length_sigma"))
+    return Segment(start, end, radius, length, name_of(name, f"id of {where}"), class_name, *sigmas)
 
 
 def _moved(pipe: Segment, world_from_map: FloatArray) -> Segment:
     rotation, shift = world_from_map[:3, :3], world_from_map[:3, 3]
-    ends = rotation @ pipe.start + shift, rotation @ pipe.end + shift
-    return Segment(*ends, pipe.radius, pipe.length, pipe.id, pipe.class_name)
+    return replace(pipe, start=rotation @ pipe.start + shift, end=rotation @ pipe.end + shift)
 
 
 def _is_ignored(detection: Segment, ignore: Sequence[Segment]) -> bool:
@@ -304,10 +311,23 @@ def _errors(detection: Segment, pipe: Segment) -> dict[str, Any]:
         "true_radius": pipe.radius,
         "true_length": pipe.length,
         "radius_error_mm": 1e3 * (detection.radius - pipe.radius),
+        "radius_error_sigmas": _normalised(detection.radius - pipe.radius, detection.radius_sigma),
         "length_error_percent": 100 * (detection.length - pipe.length) / pipe.length,
+        "length_error_sigmas": _normalised(detection.length - pipe.length, detection.length_sigma),
         "axis_distance_mm": 1e3 * float(distance),
         "angle_deg": float(np.degrees(angle)),
     }
+
+
+def _normalised(error: float, sigma: float | None) -> float | None:
+    """An error in standard deviations, None where there is none."""
+    return error / sigma if sigma else None
+
+
+def _within(errors: list[dict[str, Any]], key: str) -> float | None:
+    """Share of the errors within `SIGMAS` standard deviations, None where no sigma is known."""
+    values = [abs(e[key]) for e in errors if e[key] is not None]
+    return _ratio(sum(value <= SIGMAS for value in values), len(values))
 
 
 def _confusion(
@@ -359,7 +379,12 @@ def _radius_figures(errors: list[dict[str, Any]]) -> dict[str, Any]:
     ]
     values = [e["radius_error_mm"] for e in errors]
     bias = float(np.mean(values)) if values else None
-    return {"rmse_mm": _rms(values) if values else None, "bias_mm": bias, "per_class": figures}
+    return {
+        "rmse_mm": _rms(values) if values else None,
+        "bias_mm": bias,
+        "within_3_sigma": _within(errors, "radius_error_sigmas"),
+        "per_class": figures,
+    }
 
 
 def _length_figures(
@@ -378,7 +403,11 @@ def _length_figures(
         error = 100 * (measured - true) / true if true else None
         per_class.append({"class": name, "true_m": true, "measured_m": measured, "error_percent": error})
     values = [abs(e["length_error_percent"]) for e in errors]
-    return {"mean_error_percent": float(np.mean(values)) if values else None, "per_class": per_class}
+    return {
+        "mean_error_percent": float(np.mean(values)) if values else None,
+        "within_3_sigma": _within(errors, "length_error_sigmas"),
+        "per_class": per_class,
+    }
 
 
 def _trajectory_figures(trajectory: Alignment) -> dict[str, Any]:

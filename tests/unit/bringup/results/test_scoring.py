@@ -51,6 +51,22 @@ def test_a_perfect_result() -> None:
     assert figures["missed"] == figures["false"] == []
 
 
+def test_errors_over_their_sigmas() -> None:
+    """Two lengths of three within three sigmas; of the radii one has no sigma and one lies outside."""
+    sigmas = [(1e-4, 2e-3), (1e-4, 1e-3), (None, 1e-3)]
+    off = [(0.0, 0.0), (4e-4, -2.9e-3), (0.0, 4e-3)]
+    found = [
+        dataclasses.replace(pipe, radius=pipe.radius + dr, length=pipe.length + dl, radius_sigma=sr, length_sigma=sl)
+        for pipe, (sr, sl), (dr, dl) in zip(PERFECT, sigmas, off, strict=True)
+    ]
+    figures = scored(*found)
+    assert figures["radius"]["within_3_sigma"] == 0.5
+    assert figures["length"]["within_3_sigma"] == pytest.approx(2 / 3)
+    assert [pipe["radius_error_sigmas"] for pipe in figures["pipes"]] == [0.0, pytest.approx(4.0), None]
+    assert [pipe["length_error_sigmas"] for pipe in figures["pipes"]] == pytest.approx([0.0, -2.9, 4.0])
+    assert scored(*PERFECT)["length"]["within_3_sigma"] is None
+
+
 def test_a_swapped_class_is_found_but_not_classified() -> None:
     figures = scored(PERFECT[0], PERFECT[1], dataclasses.replace(PERFECT[2], class_name="DN65"))
     assert counts(figures["detection"]) == (3, 0, 0)
