@@ -24,6 +24,7 @@ from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import viewing_direction
 from pipeprog_detect.thin.thin_pipes import find_thin_pipes
 from pipeprog_detect.types import Cloud, Pipe, View
+from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined, own_contours
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
@@ -125,7 +126,7 @@ def detect_inside(
     radius_range = (_THINNEST_BORE * min(bores), _THICKEST * max(bores))
     criteria = seen_from_inside(prepared.sigma, config)
     found = find_concave(prepared.tree, prepared.around, criteria, radius_range, config.seed)
-    return [MeasuredPipe(each, each.cylinder, each.radius_sigma) for each in found]
+    return [_with_ends_in_cloud(MeasuredPipe.of_cloud(each)) for each in found]
 
 
 def detect_outside(
@@ -197,17 +198,22 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
 
 
 def _abutted(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:
-    """The pipes as long as the walls that they run into allow, as far as there are views to tell."""
+    """The pipes as long as the walls that they run into allow, as far as there are views to tell, with their ends."""
     if not views:
-        return list(measured)
+        return [_with_ends_in_cloud(each) for each in measured]
     cylinders = [each.cylinder for each in measured]
 
     def one(number: int) -> MeasuredPipe:
         others = cylinders[:number] + cylinders[number + 1 :]
         each = measured[number]
-        return replace(each, cylinder=with_ends_on_walls(each.cylinder, each.rims, around, views, others))
+        cylinder = with_ends_on_walls(each.cylinder, each.rims, around, views, others)
+        return replace(each, cylinder=cylinder, ends=ends_in_views(cylinder, around, views, others))
 
     return [one(number) for number in range(len(measured))]
+
+
+def _with_ends_in_cloud(measured: MeasuredPipe) -> MeasuredPipe:
+    return replace(measured, ends=ends_in_cloud(measured.cylinder, measured.candidate.points))
 
 
 def _moved(camera_from_map: FloatArray, shift: FloatArray) -> FloatArray:
@@ -238,6 +244,7 @@ def _pipe(measured: MeasuredPipe, boq: BillOfQuantities, shift: FloatArray, conc
         candidate.evidence.arc,
         candidate.evidence.noise,
         candidate.points,
+        ends=measured.ends,
     )
 
 

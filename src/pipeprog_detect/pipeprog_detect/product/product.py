@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import ClassProgress, progress
-from pipeprog_detect.product.pipe_runs import PipeRun, pipe_runs
+from pipeprog_detect.product.pipe_runs import PipeRun, pipe_runs, with_fittings
 from pipeprog_detect.types import Pipe
 
 
@@ -37,7 +37,8 @@ class Product:
 
 def product_of(pipes: Sequence[Pipe], boq: BillOfQuantities, scale_sigma: float = float("nan")) -> Product:
     """The product that these pipes make; their ids are final."""
-    return Product(list(pipes), progress(pipes, boq), pipe_runs(pipes), scale_sigma)
+    runs = pipe_runs(pipes)
+    return Product(with_fittings(pipes, runs), progress(pipes, boq), runs, scale_sigma)
 
 
 def _length_sigma(pipes: Sequence[Pipe], scale_sigma: float) -> float:

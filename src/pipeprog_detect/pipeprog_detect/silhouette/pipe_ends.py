@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,26 +89,40 @@ def find_end(scene: Scene, at_end: bool, surface_end: float | None) -> End | Non
     if not len(odds) or int(np.argmax(odds)) == len(odds) - 1:
         return None
     barrel = cylinder if at_end else Cylinder(cylinder.end, cylinder.start, cylinder.radius)
-    pixel = float(np.median([np.linalg.norm(barrel.end - view.centre) for view in scene.views]))
-    pixel = pixel / scene.views[0].camera.fx
+    pixel = pixel_at(barrel.end, scene.views)
     along = np.arange(-inside, outside, pixel / SAMPLES_PER_PIXEL, dtype=float)
-    rows = cylinder_rows(scene.others)
     axis = barrel.end + along[::SAMPLES_PER_PIXEL, None] * barrel.axis
     looking = np.flatnonzero(ViewArrays.of(scene.views).showing(axis))
     if not len(looking):
         return None
-    edges = np.concatenate([_slopes(barrel, along, scene.views[index], rows) for index in looking])
-    seen = np.isfinite(edges)
+    strength, seen = rim_strength(barrel, along, [scene.views[index] for index in looking], scene.others)
     if not seen.any():
         return None
-    typical = float(np.median(np.abs(edges[seen])))
-    strength = np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0)
-    rim = _all_around(strength, seen) - OUTER_PENALTY * np.maximum(along, 0.0) / outside
+    rim = all_around(strength, seen) - OUTER_PENALTY * np.maximum(along, 0.0) / outside
     if surface_end is not None:
         odds = odds - np.log1p(((position - surface_end) / SURFACE_SIGMA) ** 2)
     likely = np.interp(along, position, odds) - float(odds.max())
     best = int(np.argmax(np.where(likely > -PLAUSIBLE, likely + RIM_WORTH * rim, -np.inf)))
     return End(*_refined(strength, seen, along, best, pixel), RIM_WORTH * _contrast(rim, best))
+
+
+def pixel_at(point: FloatArray, views: Sequence[View]) -> float:
+    """Length [m] at a point (3,) that is one pixel in the median view."""
+    return float(np.median([np.linalg.norm(point - view.centre) for view in views])) / views[0].camera.fx
+
+
+def rim_strength(
+    barrel: Cylinder, along: FloatArray, views: Sequence[View], others: Sequence[Cylinder]
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Strength (V * SECTORS, T), 0 to 1, of edges across the axis at `along` (T,) [m] beyond the end, and where seen.
+
+    An edge as strong as twice the median one has half.
+    """
+    rows = cylinder_rows(others)
+    edges = np.concatenate([_slopes(barrel, along, view, rows) for view in views])
+    seen = np.isfinite(edges)
+    typical = float(np.median(np.abs(edges[seen]))) if seen.any() else 0.0
+    return np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0), seen
 
 
 def _contrast(rim: FloatArray, best: int) -> float:
@@ -116,7 +131,7 @@ def _contrast(rim: FloatArray, best: int) -> float:
     return max(float(rim[best]) - max(float(rim[elsewhere].max(initial=0.0)), 0.0), 0.0)
 
 
-def _all_around(strength: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
+def all_around(strength: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
     """By how much the edges (V * SECTORS, T) of all sectors exceed the median position's, at each position (T,).
 
     Texture has edges in some sectors: the weaker half of them counts. Where nothing is seen it is 0.
@@ -167,7 +182,9 @@ def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: FloatArray)
     return np.where(inside, gaussian_filter1d(mean, SAMPLES_PER_PIXEL, axis=1, order=1), np.nan)
 
 
-def _refined(strength: FloatArray, seen: FloatArray, along: FloatArray, best: int, pixel: float) -> tuple[float, float]:
+def _refined(
+    strength: FloatArray, seen: NDArray[np.bool_], along: FloatArray, best: int, pixel: float
+) -> tuple[float, float]:
     """The median of the peaks near sample `best` of each view, and its standard deviation [m]."""
     reach = 3 * SAMPLES_PER_PIXEL
     low, high = max(best - reach, 1), min(best + reach + 1, len(along) - 1)

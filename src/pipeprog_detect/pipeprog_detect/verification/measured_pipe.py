@@ -15,7 +15,7 @@ from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.free_space import SHORTEST, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
-from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.types import Cylinder, PipeEnd, View
 
 # What the cloud does not resolve is no pipe if it is shorter than this many radii: hangers and clamps are.
 SLENDER = 20.0
@@ -27,13 +27,15 @@ SAME_RADIUS, MANUFACTURE = 4.0, 0.01
 class MeasuredPipe:
     """A candidate after the keyframes: its cylinder and the standard deviation of its radius [m].
 
-    `rims`: evidence for an end rim at its start and at its end (`pipe_ends.End.odds`).
+    `rims`: evidence for an end rim at its start and at its end (`pipe_ends.End.odds`). `ends`: its start and its end,
+    once all pipes are known.
     """
 
     candidate: Candidate
     cylinder: Cylinder
     radius_sigma: float
     rims: tuple[float, float] = (0.0, 0.0)
+    ends: tuple[PipeEnd, PipeEnd] = (PipeEnd(), PipeEnd())
 
     @classmethod
     def of_cloud(cls, candidate: Candidate) -> MeasuredPipe:

@@ -54,17 +54,23 @@ def with_ends_on_walls(
     ends = []
     for at_end in (False, True):
         end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
-        ahead: list[float] = []
-        for plane in sorted(context.planes, key=lambda plane: -plane.area):
-            distance = _distance(end, out, cylinder, plane, context.walls, views)
-            # Small planes are pieces of large ones, whose position they tell less precisely.
-            if distance is not None and all(abs(distance - other) > SAME_PLANE for other in ahead):
-                ahead.append(distance)
-        nearest = min(ahead, default=0.0)
+        nearest = min(planes_ahead(cylinder, at_end, context, views), default=0.0)
         if nearest > 0.0 and not _goes_on(cylinder, at_end, rims[at_end], nearest, views, others):
             nearest = 0.0
         ends.append(end + nearest * out)
     return Cylinder(ends[0], ends[1], cylinder.radius)
+
+
+def planes_ahead(cylinder: Cylinder, at_end: bool, context: SceneContext, views: Sequence[View]) -> list[float]:
+    """How far [m] beyond an end, or before it, the axis meets the planes of the `context` that it may end at."""
+    end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
+    ahead: list[float] = []
+    for plane in sorted(context.planes, key=lambda plane: -plane.area):
+        distance = _distance(end, out, cylinder, plane, context.walls, views)
+        # Small planes are pieces of large ones, whose position they tell less precisely.
+        if distance is not None and all(abs(distance - other) > SAME_PLANE for other in ahead):
+            ahead.append(distance)
+    return ahead
 
 
 def _distance(
