@@ -80,6 +80,20 @@ def test_lengths_follow_the_scale_and_the_drift_of_the_unit(
     assert np.median(np.abs(cloud.points[:, 2] - 1.0)) < 0.003
 
 
+def test_a_cloud_is_made_anew_where_the_poses_have_moved_by_more_than_a_voxel(
+    there: tuple[DenseMapper, dict[int, np.ndarray], list[int]],
+) -> None:
+    dense, poses, _ = there
+    whole = dense.fuse(poses, poses, 1.0, complete=True, anew=True).result()
+    same = dense.fuse(poses, poses, 1.0, complete=True, anew=False).result()
+    np.testing.assert_array_equal(same.points, whole.points)
+    moved = {stamp: matrix.copy() for stamp, matrix in poses.items()}
+    for matrix in moved.values():
+        matrix[2, 3] -= 0.1  # the cameras are 0.1 m farther on in the map, and so is what they see
+    after = dense.fuse(moved, poses, 1.0, complete=True, anew=False).result()
+    assert np.median(after.points[:, 2]) - np.median(whole.points[:, 2]) == pytest.approx(0.1, abs=0.002)
+
+
 def test_what_is_seen_again_makes_no_more_depth_maps() -> None:
     _, _, counts = walk([*range(8), *range(7, -1, -1), *range(8)])
     assert 3 <= counts[9] <= 8
