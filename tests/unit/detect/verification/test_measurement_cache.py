@@ -56,6 +56,15 @@ def test_it_falls_with_a_pose_a_view_a_neighbour_or_the_candidate(pipe_views: li
     assert not memory.recall(Question.of(dataclasses.replace(PIPE, radius=0.044), True, [], pipe_views))[0]
 
 
+def test_a_tenth_more_views_are_no_reason_to_measure_again(pipe_views: list[View]) -> None:
+    views = [dataclasses.replace(view, stamp=10 * turn + view.stamp) for turn in range(3) for view in pipe_views]
+    memory = asked(views[:20])
+    assert memory.recall(Question.of(PIPE, True, [], views[:22]))[0]
+    memory.next_map()
+    assert not memory.recall(Question.of(PIPE, True, [], views[:23]))[0], "counted from the views it was measured in"
+    assert not asked(views[:20]).recall(Question.of(PIPE, True, [], views[1:21]))[0]
+
+
 def test_keyframes_are_decoded_once_within_memory() -> None:
     camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     image = np.random.default_rng(1).integers(0, 255, (48, 64), np.uint8)
