@@ -15,6 +15,7 @@ setup(
         (f"share/{package_name}", ["package.xml"]),
         (f"share/{package_name}/launch", sorted(glob("launch/*.launch.py"))),
         (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{package_name}/viewers", sorted(glob("viewers/*"))),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},  # by which colcon test knows what to run

@@ -139,8 +139,21 @@ def test_every_frame_is_considered_and_the_results_are_written(tmp_path: Path) -
     assert "DN65" in output
     assert str(out / "pipes.json") in output.replace("\n", "")
     with (out / "out.mcap").open("rb") as recorded:
-        decoded = make_reader(recorded, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        reader = make_reader(recorded, decoder_factories=[DecoderFactory()])
+        decoded = list(reader.iter_decoded_messages())
         topics = [message.channel.topic for message in decoded]
+        (record,) = reader.iter_metadata()
+    latched = {m.channel.topic for m in decoded if "durability: 1" in m.channel.metadata["offered_qos_profiles"]}
+    assert latched == {"/map_points", "/pipes", "/pipe_markers", "/keyframe_poses", "/sfm_status"}
+    images = {
+        m.message.log_time: m.decoded_message for m in decoded if m.channel.topic == "/keyframes/image/compressed"
+    }
+    moved = {m.message.log_time: m.decoded_message.transforms for m in decoded if m.channel.topic == "/tf"}
+    assert moved.keys() == images.keys(), "each keyframe has its place"
+    for stamp, (transform,) in moved.items():
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", images[stamp].header.frame_id)
+        assert transform.header.stamp == images[stamp].header.stamp
+    assert record.metadata == {"site": "boq", "survey": "out", "bag": "bag.mcap", "pipeprog": "0.1.0"}
     assert topics.count("/keyframes/image/compressed") == topics.count("/keyframes/camera_info") == 5
     assert {"/map_points", "/pipes", "/pipe_markers", "/keyframe_poses", "/sfm_status"} < set(topics)
 

@@ -83,8 +83,9 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
         with private_network(scratch), Graph(parameters, scratch, modules) as graph, _ros():
             survey, status = session.run(graph)
         with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
+            recording.describe(_described(request))
             record_survey(recording, survey, status)
-            record_keyframes(recording, inputs.bag, session.log)
+            record_keyframes(recording, inputs.bag, session.log, survey.poses)
         started = time.monotonic()
         outcome = Outcome(
             product=write_survey(folder, survey, session.log),
@@ -140,6 +141,17 @@ def _settings(request: Request, inputs: _Inputs) -> dict[str, Any]:
             "motion_topics": inputs.bag.motion_topics,
             "rate": request.rate,
         },
+    }
+
+
+def _described(request: Request) -> dict[str, str]:
+    """The metadata record of out.mcap; a site goes by the name of its bill of quantities."""
+    version = result_files.package_version("pipeprog") or "unknown"
+    return {
+        "site": request.boq.stem,
+        "survey": request.out.resolve().name,
+        "bag": request.bag.name,
+        "pipeprog": version,
     }
 
 

@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped, Transform, TransformStamped, Vector3
+from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
+from tf2_msgs.msg import TFMessage
 
 from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.playback.listener import LastMessages
@@ -52,11 +55,12 @@ def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmSta
     stamp = messages.stamp_ns(survey.poses.poses[0].header.stamp)
     recorded = [(topic, getattr(survey, name)) for name, topic in _SURVEY_TOPICS.items()] + [("sfm_status", status)]
     for topic, message in recorded:
-        recording.write(f"/{topic}", _type_name(type(message)), serialize_message(message), stamp)
+        recording.write(f"/{topic}", _type_name(type(message)), serialize_message(message), stamp, latched=True)
 
 
-def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
-    """Write the keyframes into out.mcap, each with the calibration that was sent with it."""
+def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, poses: Path) -> None:
+    """Write the keyframes into out.mcap, each with the calibration that was sent with it and its camera's transform."""
+    places = {messages.stamp_ns(place.header.stamp): place for place in poses.poses}
     chosen = {row.stamp for row in log.rows() if row.chosen}
     for frame in bag:
         if frame.stamp not in chosen or frame.fault:
@@ -69,6 +73,25 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog) -> None:
         info = serialize_message(calibration(frame))
         recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, info, frame.stamp)
         recording.write("/keyframes/image/compressed", cdr.COMPRESSED_IMAGE, data, frame.stamp)
+        if frame.stamp in places:
+            moved = _transform(places[frame.stamp], frame.frame_id)
+            recording.write("/tf", cdr.TF, serialize_message(moved), frame.stamp)
+
+
+def _transform(place: PoseStamped, camera: str) -> TFMessage:
+    """The transform from `map` to a camera's frame, by which viewers stand its image in the map."""
+    pose = place.pose
+    position = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
+    transform = Transform(translation=position, rotation=pose.orientation)
+    return TFMessage(
+        transforms=[
+            TransformStamped(
+                header=messages.header(messages.stamp_ns(place.header.stamp), "map"),
+                child_frame_id=camera,
+                transform=transform,
+            )
+        ]
+    )
 
 
 def product_from_msg(message: msg.PipeArray) -> Product:
