@@ -152,7 +152,7 @@ def test_every_frame_is_considered_and_the_results_are_written(tmp_path: Path) -
     assert moved.keys() == images.keys(), "each keyframe has its place"
     for stamp, (transform,) in moved.items():
         assert (transform.header.frame_id, transform.child_frame_id) == ("map", images[stamp].header.frame_id)
-        assert transform.header.stamp == images[stamp].header.stamp
+        assert str(transform.header.stamp) == str(images[stamp].header.stamp), "decoded as two classes of one name"
     assert record.metadata == {"site": "boq", "survey": "out", "bag": "bag.mcap", "pipeprog": "0.1.0"}
     assert topics.count("/keyframes/image/compressed") == topics.count("/keyframes/camera_info") == 5
     assert {"/map_points", "/pipes", "/pipe_markers", "/keyframe_poses", "/sfm_status"} < set(topics)
