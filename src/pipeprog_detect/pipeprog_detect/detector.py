@@ -28,6 +28,7 @@ from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined, own_contours
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
+from pipeprog_detect.verification.open_ends import with_open_ends
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import with_ends_on_walls
 
@@ -152,7 +153,8 @@ def detect_outside(
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(prepared.points, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
-    return _abutted(joined(measured, judging), around, judging)
+    whole = with_open_ends(joined(measured, judging), around, judging)
+    return _abutted(whole, around, judging)
 
 
 def _candidates(

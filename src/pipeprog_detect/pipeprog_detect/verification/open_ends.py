@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ends that something hides in all keyframes: the pipe is as long as it is expected to be, no shorter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
+from pipeprog_detect.silhouette.extension import CERTAIN, FARTHEST, LEAST, axial_evidence
+from pipeprog_detect.silhouette.free_space import MIN_VIEWS, free_stretches
+from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+from pipeprog_detect.verification.scene_context import SceneContext
+from pipeprog_detect.verification.wall_ends import MEETS
+
+# Distance [m] between the positions of the end that are weighed: the step of a free stretch.
+STEP = 0.01
+# Views that tell the evidence of the contour: of more than thirty each adds less than a hundredth, since errors that
+# views share (COMMON) remain.
+ENOUGH_VIEWS = 30
+
+
+def with_open_ends(
+    measured: Sequence[MeasuredPipe], context: SceneContext, views: Sequence[View]
+) -> list[MeasuredPipe]:
+    """The pipes with each end that the views leave open where it is expected.
+
+    Growth adds what is certain, and stops where something hides the pipe. Its end then lies farther, never nearer: the
+    lengths of all pipes that something hides would be too short.
+    """
+    if not views:
+        return list(measured)
+    cylinders = [each.cylinder for each in measured]
+
+    def one(number: int) -> MeasuredPipe:
+        others = cylinders[:number] + cylinders[number + 1 :]
+        each, cylinder = measured[number], cylinders[number]
+        start, end = (_expected(each, at_end, context, views, others) for at_end in (False, True))
+        longer = Cylinder(cylinder.start - start * cylinder.axis, cylinder.end + end * cylinder.axis, cylinder.radius)
+        rims = (0.0 if start else each.rims[0], 0.0 if end else each.rims[1])
+        return replace(each, cylinder=longer, rims=rims)
+
+    return [one(number) for number in range(len(measured))]
+
+
+def _expected(
+    measured: MeasuredPipe, at_end: bool, context: SceneContext, views: Sequence[View], others: Sequence[Cylinder]
+) -> float:
+    """How far [m] beyond a given end the pipe is expected to end; 0 where that is less than the ends are known to.
+
+    Prior: ends occur as a Poisson process with one end per measured length. The evidence of the contour is added;
+    where something hides the pipe there is none.
+    """
+    cylinder, rim = measured.cylinder, measured.rims[at_end]
+    if rim > CERTAIN:
+        return 0.0
+    ahead = _clear(cylinder, at_end, context, views, others)
+    if ahead < LEAST:
+        return 0.0
+    end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
+    looking = views_showing(end + np.linspace(0.0, ahead, 9)[:, None] * out, views, ENOUGH_VIEWS)
+    evidence = axial_evidence(Scene.of(cylinder, looking, others), at_end, ahead)
+    if evidence is None:
+        return 0.0
+    beyond = evidence.along > 0.0
+    total = np.append(0.0, np.cumsum(evidence.log_odds[beyond]))
+    place = np.arange(0.0, ahead, STEP)
+    odds = total[np.searchsorted(evidence.along[beyond], place)] - place / cylinder.length
+    odds[0] += rim
+    probability = np.exp(odds - odds.max())
+    expected = float(probability @ place / probability.sum())
+    return expected if expected > LEAST else 0.0
+
+
+def _clear(
+    cylinder: Cylinder, at_end: bool, context: SceneContext, views: Sequence[View], others: Sequence[Cylinder]
+) -> float:
+    """How far [m] beyond an end the pipe may go on at the most, within the images.
+
+    No farther than a plane, another pipe, a stretch through which the views see, or the edge of the images.
+    """
+    end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
+    ahead = min(cylinder.length, FARTHEST)
+    for plane in context.planes:
+        slope = float(plane.normal @ out)
+        distance = float(plane.offset - plane.normal @ end) / slope if abs(slope) > MEETS else ahead
+        ahead = min(ahead, distance) if distance > 0.0 else ahead
+    place = np.arange(STEP, ahead, STEP)
+    points: FloatArray = end + place[:, None] * out
+    shown = np.sum([in_image(view, points) for view in views], axis=0)
+    ended = shown < MIN_VIEWS
+    for other in others:
+        along = other.along(points)
+        within = np.linalg.norm(other.from_axis(points), axis=1) < other.radius
+        ended |= within & (along > 0.0) & (along < other.length)
+    if ended.any():
+        ahead = float(place[int(np.argmax(ended))])
+    if ahead < LEAST:
+        return 0.0
+    free = free_stretches(Cylinder(end, end + ahead * out, cylinder.radius), views, others)
+    return min([ahead, *(first for first, _ in free)])
