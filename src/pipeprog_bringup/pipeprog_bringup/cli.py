@@ -292,12 +292,23 @@ def export(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the files; without, DIR/export.", metavar="FOLDER")
     ] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option("--points", help="Control points (YAML): the site's coordinates.", metavar="POINTS.yaml"),
+    ] = None,
+    board: Annotated[
+        Path | None, typer.Option("--board", help="Boards whose circles are control points.", metavar="BOARD.yaml")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files of an earlier export.")] = False,
 ) -> None:
     """Write the results for other programs: `pipeprog export out/demo --to xlsx --to csv`."""
     from pipeprog_bringup.export.formats import export as write
+    from pipeprog_bringup.export.formats import site_alignment
 
-    for path in write(folder, to, out or folder / "export", force):
+    alignment, told = (None, []) if points is None else site_alignment(folder, points, board)
+    for sentence in told:
+        _say(sentence)
+    for path in write(folder, to, out or folder / "export", force, alignment):
         _say(f"Written: {path}")
 
 

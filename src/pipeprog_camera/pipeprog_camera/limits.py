@@ -65,6 +65,7 @@ MAX_PIPE_LENGTH = 1e7  # m of one class; the Earth's quarter
 MAX_BOARD_CIRCLES = 256  # of one board; calibration targets have 20 x 14 at most, and symmetries go with the cube
 MAX_CIRCLES = 2000  # of all boards and scale bars of a site, which has ten boards of five
 MAX_KNOWN_DISTANCES = 1000  # between boards; each is measured by hand
+MAX_CONTROL_POINTS = 1000  # of a site; surveyors mark ten
 MAX_PIPES = 10_000  # of one survey; a storey of a hospital has some hundreds
 MAX_SCORED = 2000  # pipes of a result or truth that is scored: each is compared with each
 MAX_TARGET_LENGTH = 1e5  # m; a board's circles, and distances between boards on one site

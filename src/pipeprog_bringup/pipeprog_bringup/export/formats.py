@@ -7,13 +7,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeprog_bringup.export.control_points import Alignment, align, load_control_points
 from pipeprog_bringup.export.csv_tables import write_classes, write_pipes
 from pipeprog_bringup.export.ifc import write_ifc
-from pipeprog_bringup.export.survey import Survey, read_survey
+from pipeprog_bringup.export.point_places import points_in_map
+from pipeprog_bringup.export.survey import Site, Survey
 from pipeprog_bringup.export.xlsx import write_xlsx
 from pipeprog_bringup.results.atomic_output import output_file
+from pipeprog_bringup.results.results_reader import read_results
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import nearest, shown
+from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
 Writer = Callable[[Survey, Path], None]
 
@@ -32,16 +36,33 @@ FORMATS = {
 }
 
 
-def export(folder: Path, names: Sequence[str], out: Path, force: bool = False) -> list[Path]:
+def site_alignment(folder: Path, points: Path, board: Path | None) -> tuple[Alignment, list[str]]:
+    """Where the site's coordinates lie in the map of a results folder, and a sentence on each control point.
+
+    Raises InputError, naming the point, where the points' places cannot be had or do not agree.
+    """
+    file = load_control_points(points)
+    boards = load_board_file(board) if board else BoardFile()
+    found = align(file, points_in_map(file.points, read_results(folder), boards))
+    told = [
+        f"control point {point.name}: {1e3 * residual:.1f} mm off"
+        for point, residual in zip(file.points, found.residuals, strict=True)
+    ]
+    return found, [*told, f"a metre of the map is {found.scale:.5f} m between the control points"]
+
+
+def export(
+    folder: Path, names: Sequence[str], out: Path, force: bool = False, alignment: Alignment | None = None
+) -> list[Path]:
     """Writes a results folder in the formats `names` into the folder `out`; returns the files.
 
-    Raises InputError where the folder holds no results, a format is not known or needs what is not installed, or a
-    file exists and `force` is not set.
+    Coordinates are those of the map, or of the site that `alignment` leads to. Raises InputError where the folder holds
+    no results, a format is not known or needs what is not installed, or a file exists and `force` is not set.
     """
     for name in names:
         if name not in FORMATS:
             raise InputError(f"--to {shown(name)}: no such format: did you mean '{nearest(name, FORMATS)}'?")
-    survey = read_survey(folder)
+    survey = Survey(read_results(folder), Site() if alignment is None else alignment.site)
     written = []
     for name in dict.fromkeys(names):
         for file, write in FORMATS[name].files.items():

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeprog_bringup.results.plan_file import read_plan
-from pipeprog_bringup.results.results_reader import Results, read_results
+from pipeprog_bringup.results.results_reader import Results
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.product.installed_where_planned import FoundPipe, PlannedState, installed_where_planned
 from pipeprog_detect.types import Cylinder
@@ -128,11 +128,6 @@ class Survey:
     def recording(self) -> str:
         """Name of the recording or cloud, empty where run.json does not tell."""
         return Path(str(self.results.facts.get("bag", self.results.facts.get("cloud", "")))).name
-
-
-def read_survey(folder: Path) -> Survey:
-    """The survey in a results folder; raises InputError where it holds none."""
-    return Survey(read_results(folder))
 
 
 def _line(class_name: str, line: dict[str, Any]) -> BillLineRow:
