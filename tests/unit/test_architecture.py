@@ -89,6 +89,7 @@ DEPENDENCIES = {
     "lz4": None,
     "mcap": None,
     "mcap_ros2": None,
+    "ezdxf": None,
     "ifcopenshell": None,
     "open3d": None,
     "openpyxl": None,

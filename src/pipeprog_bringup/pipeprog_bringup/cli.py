@@ -288,7 +288,10 @@ def view(
 @app.command(rich_help_panel="From results")
 def export(
     folder: Annotated[Path, typer.Argument(help="Results of a survey.", metavar="DIR")],
-    to: Annotated[list[str], typer.Option("--to", help="Format; may be repeated: xlsx, csv, ifc.", metavar="FORMAT")],
+    to: Annotated[
+        list[str],
+        typer.Option("--to", help="Format; may be repeated: xlsx, csv, ifc, dxf, glb, laz, colmap.", metavar="FORMAT"),
+    ],
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the files; without, DIR/export.", metavar="FOLDER")
     ] = None,

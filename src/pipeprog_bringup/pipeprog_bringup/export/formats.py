@@ -7,13 +7,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeprog_bringup.export.colmap import write_colmap
 from pipeprog_bringup.export.control_points import Alignment, align, load_control_points
 from pipeprog_bringup.export.csv_tables import write_classes, write_pipes
+from pipeprog_bringup.export.dxf import write_dxf
+from pipeprog_bringup.export.glb import write_glb
 from pipeprog_bringup.export.ifc import write_ifc
+from pipeprog_bringup.export.laz import write_laz
 from pipeprog_bringup.export.point_places import points_in_map
 from pipeprog_bringup.export.survey import Site, Survey
 from pipeprog_bringup.export.xlsx import write_xlsx
-from pipeprog_bringup.results.atomic_output import output_file
+from pipeprog_bringup.results.atomic_output import OutputFolder, output_file
 from pipeprog_bringup.results.results_reader import read_results
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import nearest, shown
@@ -24,7 +28,7 @@ Writer = Callable[[Survey, Path], None]
 
 @dataclass(frozen=True)
 class Format:
-    """A format: the files that it consists of, each with its writer."""
+    """A format: the files that it consists of, each with its writer; a name that ends with / is that of a folder."""
 
     files: dict[str, Writer]
 
@@ -32,6 +36,10 @@ class Format:
 FORMATS = {
     "xlsx": Format({"survey.xlsx": write_xlsx}),
     "ifc": Format({"survey.ifc": write_ifc}),
+    "dxf": Format({"axes.dxf": write_dxf}),
+    "glb": Format({"pipes.glb": write_glb}),
+    "laz": Format({"cloud.laz": write_laz}),
+    "colmap": Format({"colmap/": write_colmap}),
     "csv": Format({"classes.csv": write_classes, "pipes.csv": write_pipes}),
 }
 
@@ -66,7 +74,11 @@ def export(
     written = []
     for name in dict.fromkeys(names):
         for file, write in FORMATS[name].files.items():
-            with output_file(out / file, force) as temporary:
-                write(survey, temporary)
+            if file.endswith("/"):
+                with OutputFolder(out / file, force) as stage:
+                    write(survey, stage.file("."))
+            else:
+                with output_file(out / file, force) as temporary:
+                    write(survey, temporary)
             written.append(out / file)
     return written

@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeprog_bringup.export.survey import Survey, SurveyPipe
+from pipeprog_bringup.export.survey import Survey, SurveyPipe, along_axis
 from pipeprog_bringup.export.tables import positive
 from pipeprog_bringup.results.results_reader import UNPLANNED, Color
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.types import Cylinder
 
 # The GUIDs that are made of names and ids begin here: the same pipe of a site is the same object in every file.
 _NAMESPACE = uuid.UUID("5c1f0d0e-3a54-4a8e-9d1b-0f7f6c1f2b11")
@@ -82,7 +81,7 @@ class _Model:
             type.assign_type(self.file, related_objects=[segment], relating_type=self._type_of(pipe.class_name))
         else:
             segment.PredefinedType = "RIGIDSEGMENT"
-        placement = _placement(pipe.cylinder, self._survey.site.origin)
+        placement = along_axis(pipe.cylinder, self._survey.site.origin)
         geometry.edit_object_placement(self.file, product=segment, matrix=placement)
         circle = profile.add_parameterized_profile(self.file, ifc_class="IfcCircleProfileDef")
         profile.edit_profile(
@@ -171,20 +170,6 @@ class _Model:
         outward = np.diag([1.0, 1.0, 1.0, 1.0]) if at > 0.0 else np.diag([1.0, -1.0, -1.0, 1.0])
         outward[2, 3] = at
         geometry.edit_object_placement(self.file, product=port, matrix=placement @ outward)
-
-
-def _placement(cylinder: Cylinder, origin: FloatArray) -> FloatArray:
-    """(4, 4) with z along the axis, its origin at the start, x level."""
-    axis = cylinder.axis
-    level = np.cross([0.0, 0.0, 1.0], axis)
-    if np.linalg.norm(level) < 1e-6:
-        level = np.array([1.0, 0.0, 0.0])
-    x = level - (level @ axis) * axis
-    x /= np.linalg.norm(x)
-    placement = np.eye(4)
-    placement[:3, 0], placement[:3, 1], placement[:3, 2] = x, np.cross(axis, x), axis
-    placement[:3, 3] = cylinder.start - origin
-    return placement
 
 
 def _set_order(file: Any) -> None:

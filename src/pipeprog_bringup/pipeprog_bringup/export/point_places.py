@@ -60,9 +60,10 @@ def _circles(frames: Sequence[Keyframe], boards: BoardFile) -> dict[str, FloatAr
             grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), np.uint8)
             ellipses[frame.stamp] = detect_ellipses(grey, camera, BoardConfig())
             seen[frame.stamp] = detect_boards(ellipses[frame.stamp], boards.boards, camera)
-    posed = PosedCamera(camera, {frame.stamp: np.linalg.inv(frame.pose) for frame in frames})
+    from_map = {frame.stamp: np.asarray(np.linalg.inv(frame.pose), np.float64) for frame in frames}
+    posed = PosedCamera(camera, from_map)
     return {
-        f"{place.board.name}/{number}": np.asarray(circle, float)
+        f"{place.board.name}/{number}": circle
         for place in place_boards(seen, posed, boards.boards, ellipses)
         for number, circle in enumerate(place.circles_in_model, 1)
     }

@@ -130,6 +130,20 @@ class Survey:
         return Path(str(self.results.facts.get("bag", self.results.facts.get("cloud", "")))).name
 
 
+def along_axis(cylinder: Cylinder, origin: FloatArray) -> FloatArray:
+    """(4, 4) with z along the axis, its origin at the start less `origin` (3,), x level."""
+    axis = cylinder.axis
+    level = np.cross([0.0, 0.0, 1.0], axis)
+    if np.linalg.norm(level) < 1e-6:
+        level = np.array([1.0, 0.0, 0.0])
+    x = level - (level @ axis) * axis
+    x /= np.linalg.norm(x)
+    placement = np.eye(4)
+    placement[:3, 0], placement[:3, 1], placement[:3, 2] = x, np.cross(axis, x), axis
+    placement[:3, 3] = cylinder.start - origin
+    return placement
+
+
 def _line(class_name: str, line: dict[str, Any]) -> BillLineRow:
     planned = line.get("planned_length_m")
     texts = (str(line.get(key, "")) for key in ("system", "zone", "activity", "start", "finish"))

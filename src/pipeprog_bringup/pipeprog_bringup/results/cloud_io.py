@@ -92,12 +92,16 @@ def write_las(
     points: NDArray[np.floating],
     colors: NDArray[np.uint8] | None = None,
     normals: NDArray[np.floating] | None = None,
+    offset: NDArray[np.floating] | None = None,
 ) -> None:
-    """LAS 1.4 of points (N, 3) [m] to the tenth of a millimetre, as `write_ply`; normals as extra dimensions."""
+    """LAS 1.4 of points (N, 3) [m] to the tenth of a millimetre, as `write_ply`; normals as extra dimensions.
+
+    A path that ends with .laz is compressed; `offset` (3,) [m] lies near points that are far from the origin.
+    """
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=6 if colors is None else 7)
-    header.scales, header.offsets = np.full(3, LAS_STEP), np.zeros(3)
+    header.scales, header.offsets = np.full(3, LAS_STEP), np.zeros(3) if offset is None else offset
     header.creation_date = None  # the same cloud, the same bytes
     if normals is not None:
         header.add_extra_dims([laspy.ExtraBytesParams(name, np.float32) for name in NORMALS[0]])
