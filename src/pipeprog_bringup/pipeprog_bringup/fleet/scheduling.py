@@ -29,6 +29,7 @@ _TOPIC = "pipeprog-fleet"
 _POLL_SECONDS = 0.5  # between two looks at how many workers there are
 _CONNECT_SECONDS = 30.0  # for the first answer of a scheduler
 _PATIENCE_SECONDS = 1800.0  # for one that was there to come back: a machine that starts again takes minutes
+_BARE_SECONDS = 60.0  # without a worker on this machine, whose start takes 5 s: Dask has given up starting it
 _SPARE = 0.9  # of a machine's memory; the rest is for its system and the worker itself
 
 Tell = Callable[[dict[str, Any]], None]
@@ -45,20 +46,31 @@ def local_cluster(cores: int, cores_each: int) -> Iterator[Client]:
     with (
         scratch_folder() as scratch,
         dask.config.set({"distributed.admin.low-level-log-length": 100, "distributed.worker.daemon": False}),
-        LocalCluster(
-            n_workers=1,
-            threads_per_worker=slots,
-            processes=True,
-            resources={SLOT: slots, MEMORY: int(_SPARE * MEMORY_LIMIT / 1e6)},
-            memory_limit=0,
-            local_directory=str(scratch),
-            dashboard_address=None,
-            security=True,
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,
+        _started(slots, scratch) as cluster,
+        Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+def _started(slots: int, scratch: Path) -> LocalCluster:
+    """A local cluster whose worker has come up; one that is killed while it starts is started again."""
+    for is_last in (False, False, True):
+        try:
+            return LocalCluster(
+                n_workers=1,
+                threads_per_worker=slots,
+                processes=True,
+                resources={SLOT: slots, MEMORY: int(_SPARE * MEMORY_LIMIT / 1e6)},
+                memory_limit=0,
+                local_directory=str(scratch),
+                dashboard_address=None,
+                security=True,
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as error:
+            if is_last:
+                raise InputError(f"Dask starts no worker on this machine ({error}): look at its memory") from None
+    raise AssertionError("the last try returns or raises")
 
 
 class RemoteCluster:
@@ -102,7 +114,7 @@ def run(tasks: Sequence[Task], connect: Connect, runner: Runner, tell: Tell) -> 
                 del left[outcome.name]
                 yield outcome
         if left:
-            tell({"lost": "the scheduler is gone; waiting for it"})
+            tell({"lost": "the cluster is gone; connecting again"})
 
 
 class _Session:
@@ -115,6 +127,7 @@ class _Session:
         self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._alone: set[str] = set()
         self._logs: dict[str, str] = {}
+        self._staffed = time.monotonic()  # when there was a worker
 
     def outcomes(self) -> Iterator[Outcome]:
         """Outcomes as they come. No more tasks are with the scheduler than it has slots for.
@@ -124,11 +137,11 @@ class _Session:
         self._client.subscribe_topic(_TOPIC, lambda event: self._hear(event[1]))
         try:
             while self._waiting or self._running:
-                self._submit()
+                self._submit(self._offers())
                 try:
                     future = self._ended.get(timeout=_POLL_SECONDS)
                 except queue.Empty:
-                    if self._client.status == "closed":
+                    if self._is_lost():
                         return
                     continue
                 task = self._running.pop(future)
@@ -136,20 +149,31 @@ class _Session:
                     return
                 outcome = self._outcome(future, task)
                 future.release()
-                if outcome is not None:
+                if outcome is None:
+                    self._waiting.append(task)
+                else:
                     yield outcome
         finally:
             with contextlib.suppress(OSError, RuntimeError, TimeoutError):
                 self._client.cancel(list(self._running))
 
-    def _submit(self) -> None:
-        """Give the cluster what it has room for."""
-        if not self._waiting:
-            return
+    def _offers(self) -> list[dict[str, float]]:
+        """Resources of each worker."""
         try:
             offers = [worker["resources"] for worker in self._client.scheduler_info()["workers"].values()]
         except (OSError, RuntimeError):  # the connection is just being lost
-            return
+            return []
+        if offers:
+            self._staffed = time.monotonic()
+        return offers
+
+    def _is_lost(self) -> bool:
+        """Whether the cluster will not come back: workers elsewhere may start at any time."""
+        is_bare = self._client.cluster is not None and time.monotonic() > self._staffed + _BARE_SECONDS
+        return is_bare or self._client.status == "closed"
+
+    def _submit(self, offers: Sequence[dict[str, float]]) -> None:
+        """Give the cluster what it has room for."""
         slots = [int(offer.get(SLOT, 0)) for offer in offers]
         if offers and not any(slots):
             raise InputError(
@@ -178,7 +202,6 @@ class _Session:
         log = self._logs.get(task.name, "")
         if task.name not in self._alone:
             self._alone.add(task.name)
-            self._waiting.appendleft(task)
             return None
         reason = "its worker died whenever it ran, at last on a worker of its own"
         return Outcome(task.name, "failed", reason, log)
