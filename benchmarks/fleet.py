@@ -204,10 +204,12 @@ def _kill_workers(folder: Path, runner: str, count: int, moments: random.Random,
         shutil.rmtree(folder / "workers", ignore_errors=True)
         fleet = _fleet(folder, "workers", runner, 2)
         while fleet.poll() is None and killed < count:
+            _wait_for_survey(fleet, folder / "tmp")
             with contextlib.suppress(subprocess.TimeoutExpired):
-                fleet.wait(moments.uniform(0.2, 2.5) * mean)
+                fleet.wait(moments.uniform(0.0, 2.0) * mean)
             for worker in _dask_workers(fleet.pid):
                 worker.kill()
+                worker.wait()
                 killed += 1
                 print(f"worker killed ({killed})", flush=True)
         _finish(fleet)
@@ -220,8 +222,9 @@ def _kill_schedulers(folder: Path, runner: str, count: int, moments: random.Rand
     while True:
         fleet = _fleet(folder, "schedulers", runner, 2)
         if killed < count:
+            _wait_for_survey(fleet, folder / "tmp")
             with contextlib.suppress(subprocess.TimeoutExpired):
-                fleet.wait(moments.uniform(0.5, 2.0) * mean)
+                fleet.wait(moments.uniform(0.0, 1.5) * mean)
             if fleet.poll() is not None:
                 shutil.rmtree(folder / "schedulers")
                 continue
@@ -243,6 +246,12 @@ def _fleet(folder: Path, out: str, runner: str, workers: int) -> subprocess.Pope
 def _finish(fleet: subprocess.Popen[bytes]) -> None:
     if fleet.wait():
         raise RuntimeError(f"a fleet ended with {fleet.returncode}")
+
+
+def _wait_for_survey(fleet: subprocess.Popen[bytes], scratch: Path) -> None:
+    """Until a survey runs, or the fleet has ended."""
+    while fleet.poll() is None and not any(scratch.glob("pipeprog-fleet-*/dask-scratch-space/worker-*/survey-*")):
+        time.sleep(0.05)
 
 
 def _dask_workers(pid: int) -> list[psutil.Process]:
