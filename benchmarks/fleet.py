@@ -179,7 +179,7 @@ def kills(recordings: int, frames: int, workers: int, schedulers: int, is_stand_
         mean = (time.monotonic() - started) / recordings
         killed = _kill_workers(folder, runner, workers, moments, pause or mean)
         killed_schedulers = _kill_schedulers(folder, runner, schedulers, moments, pause or mean)
-        left = sorted(path.name for path in scratch.iterdir() if path.name.startswith("pipeprog-"))
+        left = sorted(path.name for path in scratch.iterdir())
     names = sorted(path.stem for path in (folder / "in").iterdir())
     return {
         "runner": f"surveys of {STAND_IN_SECONDS} s" if is_stand_in else f"pipeprog replay of {frames} frames",

@@ -45,7 +45,7 @@ def local_cluster(cores: int, cores_each: int) -> Iterator[Client]:
     slots = max(1, cores // cores_each)
     with (
         scratch_folder() as scratch,
-        dask.config.set({"distributed.admin.low-level-log-length": 100, "distributed.worker.daemon": False}),
+        dask.config.set({"temporary-directory": str(scratch), "distributed.admin.low-level-log-length": 100}),
         _started(slots, scratch) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
@@ -63,7 +63,8 @@ def _started(slots: int, scratch: Path) -> LocalCluster:
                 resources={SLOT: slots, MEMORY: int(_SPARE * MEMORY_LIMIT / 1e6)},
                 memory_limit=0,
                 local_directory=str(scratch),
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # without one, Dask serves its state on every interface
+                worker_dashboard_address="127.0.0.1:0",
                 security=True,
                 silence_logs=logging.CRITICAL,
             )
@@ -182,7 +183,7 @@ class _Session:
         room = max((offer[MEMORY] for offer in offers if MEMORY in offer), default=None)
         while self._waiting and len(self._running) < max(1, sum(slots)):
             task = self._waiting.popleft()
-            needed = {SLOT: max(slots) if task.name in self._alone and slots else 1}
+            needed: dict[str, float] = {SLOT: max(slots) if task.name in self._alone and slots else 1}
             if room is not None:
                 needed[MEMORY] = min(task.memory, room)  # of a worker that is too small for it, it gets all
             key = f"survey-{task.name}-{time.monotonic_ns()}"  # never that of an earlier try, which may be cancelled
