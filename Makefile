@@ -60,7 +60,7 @@ demo: setup ## the recording in bags/ through the node graph, and its report
 	@$(BIN)/pipeprog report $(DEMO) --out $(DEMO)/report.html --force
 
 test: setup $(VENV)/.fleet ## unit and integration tests
-	@$(BIN)/python -m pytest tests/unit tests/integration
+	@$(BIN)/python -m pytest --numprocesses $$(nproc) --maxprocesses 4 --dist worksteal tests/unit tests/integration
 
 lint: setup ## ruff and mypy
 	@$(BIN)/ruff check .

@@ -44,13 +44,13 @@ MUTANTS = {
         "pipeprog_frames.policy.selector.FrameSelector.flush",
         "return decisions + self._leave_window()",
         "return decisions",
-        "frames/test_selector.py",
+        "frames/policy/test_selector.py",
     ),
     "frames: the first frame between two for the sharpest": Mutant(
         "pipeprog_frames.incoming.frame_buffer.FrameStore.sharpest_between",
         "max(sharp, key=lambda stamp: sharp[stamp], default=None)",
         "min(sharp, default=None)",
-        "frames/test_frame_buffer.py",
+        "frames/incoming/test_frame_buffer.py",
     ),
     "sparse: half a pixel between COLMAP and ROS": Mutant(
         "pipeprog_sfm.sparse.colmap._pixels", " + HALF_PIXEL", "", "sfm/sparse/test_colmap.py"

@@ -3,21 +3,29 @@
 
 import contextlib
 import resource
+import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from pipeprog_bringup.playback.private_network import private_network
 
 _KEPT = contextlib.ExitStack()
+
+# How long an example takes says how busy the machine is, not whether the code is right.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Before any test module initialises ROS; processes that tests start inherit it."""
     folder = _KEPT.enter_context(tempfile.TemporaryDirectory())
     _KEPT.enter_context(private_network(Path(folder)))
+    # The processes of pytest-xdist ignore Ctrl-C, and so would all that tests start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
