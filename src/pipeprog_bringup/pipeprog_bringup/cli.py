@@ -249,13 +249,16 @@ def report(
         Path, typer.Option("--out", help="The page to write (.html), or a folder for it.", metavar="REPORT")
     ],
     force: Annotated[bool, typer.Option("--force", help="Replace the page that --out names.")] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Print the page to a PDF beside it, with Chromium or Chrome.")
+    ] = False,
 ) -> None:
     """Write one HTML page: progress of each class, a 3-D view, each pipe with its photographs, plan and elevations."""
     from pipeprog_bringup.console import share_bar
     from pipeprog_bringup.report.page import report as write
 
     with share_bar("report") as show:
-        target = write(folders, out, force, show)
+        target = write(folders, out, force, show, pdf)
     _say(f"Report: {target}")
 
 

@@ -13,6 +13,7 @@ from jinja2 import Environment, StrictUndefined, Template
 
 from pipeprog_bringup.report import plots, viewer_data
 from pipeprog_bringup.report.content import Content, gather, kmeans_matrix
+from pipeprog_bringup.report.paper import browser, print_page
 from pipeprog_bringup.report.summary import metres, with_sigma
 from pipeprog_bringup.report.survey_reader import Survey, read_survey
 from pipeprog_bringup.results.atomic_output import output_file
@@ -20,22 +21,31 @@ from pipeprog_bringup.results.results_reader import UNPLANNED, Color
 from pipeprog_camera.errors import InputError
 
 
-def report(folders: Sequence[Path], out: Path, force: bool, show: Callable[[float, str], None]) -> Path:
-    """Write the page about the runs in `folders`, the newest in full; returns its file.
+def report(
+    folders: Sequence[Path], out: Path, force: bool, show: Callable[[float, str], None], pdf: bool = False
+) -> Path:
+    """Write the page about the runs in `folders`, the newest in full, and with `pdf` its print beside it.
 
-    `out` is an .html file, or a folder that gets a report.html. Raises InputError where a folder holds no results.
+    `out` is an .html file, or a folder that gets a report.html. Returns the page's file. Raises InputError where a
+    folder holds no results.
     """
     target = out / "report.html" if out.is_dir() or not out.suffix else out
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out {out}: the report is a page, name it .html")
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise InputError("a folder is given twice: give each survey once")
+    if pdf:
+        browser()
     surveys = sorted((read_survey(folder) for folder in folders), key=lambda survey: (survey.time, survey.name))
     content = gather(surveys, show)
     show(0.8, "page")
     with output_file(target, force) as temporary:
         # Halves of surrogate pairs, which JSON can hold, are no text in UTF-8.
         temporary.write_text(page(content), encoding="utf-8", errors="replace")
+    if pdf:
+        show(0.9, "print")
+        with output_file(target.with_suffix(".pdf"), force) as temporary:
+            print_page(target, temporary)
     show(1.0, "done")
     return target
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeprog_bringup.report.page import report
+from pipeprog_bringup.report.paper import print_page
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.cloud_io import write_ply
 from pipeprog_detect.product.classification import ClassProgress
@@ -89,6 +90,13 @@ def test_the_first_sheet_of_paper_answers(browser: Browser, page: Path, paper: s
     for backgrounds in (False, True):
         browser.pdf(tmp_path / "page.pdf", *PAPERS[paper], backgrounds)
         assert (tmp_path / "page.pdf").read_bytes().count(b"/Type /Page\n") in range(1, 8)
+
+
+def test_the_report_as_pdf(page: Path, tmp_path: Path) -> None:
+    print_page(page, tmp_path / "report.pdf")
+    written = (tmp_path / "report.pdf").read_bytes()
+    assert written.startswith(b"%PDF")
+    assert written.count(b"/Subtype /Image") >= 4, "two photographs of the pipes and two stills"
 
 
 def test_a_click_on_a_pipe_shows_its_row_and_photograph(browser: Browser, page: Path) -> None:

@@ -174,6 +174,14 @@ def test_what_cannot_be_reported_is_an_error(tmp_path: Path) -> None:
         report([folder], tmp_path / "r.html", False, silent)
 
 
+def test_a_pdf_without_a_browser_is_refused_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = survey(tmp_path / "run")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="apt-get install chromium"):
+        report([folder], tmp_path / "r.html", False, silent, pdf=True)
+    assert not (tmp_path / "r.html").exists()
+
+
 def test_the_nearer_surface_is_seen() -> None:
     front = render.ColoredPipe(cylinder(0.0), (1.0, 0.0, 0.0), "")
     back = render.ColoredPipe(Cylinder(np.array([0, 1.0, 0]), np.array([0, 1.0, 2]), 0.1), (0.0, 0.0, 1.0), "")
