@@ -293,7 +293,9 @@ def export(
     folder: Annotated[Path, typer.Argument(help="Results of a survey.", metavar="DIR")],
     to: Annotated[
         list[str],
-        typer.Option("--to", help="Format; may be repeated: xlsx, csv, ifc, dxf, glb, laz, colmap.", metavar="FORMAT"),
+        typer.Option(
+            "--to", help="Format; may be repeated: xlsx, csv, ifc, bcf, dxf, glb, laz, colmap.", metavar="FORMAT"
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the files; without, DIR/export.", metavar="FOLDER")

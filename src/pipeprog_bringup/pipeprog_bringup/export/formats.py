@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeprog_bringup.export.bcf import write_bcf
 from pipeprog_bringup.export.colmap import write_colmap
 from pipeprog_bringup.export.control_points import Alignment, align, load_control_points
 from pipeprog_bringup.export.csv_tables import write_classes, write_pipes
@@ -36,6 +37,7 @@ class Format:
 FORMATS = {
     "xlsx": Format({"survey.xlsx": write_xlsx}),
     "ifc": Format({"survey.ifc": write_ifc}),
+    "bcf": Format({"issues.bcf": write_bcf}),
     "dxf": Format({"axes.dxf": write_dxf}),
     "glb": Format({"pipes.glb": write_glb}),
     "laz": Format({"cloud.laz": write_laz}),

@@ -7,29 +7,26 @@ viewer shows. Only what was measured is written: no walls, materials or pressure
 
 from __future__ import annotations
 
-import uuid
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeprog_bringup.export.survey import Survey, SurveyPipe, along_axis
+from pipeprog_bringup.export.guids import ifc_guid
+from pipeprog_bringup.export.survey import NO_TIME, Survey, SurveyPipe, along_axis
 from pipeprog_bringup.export.tables import positive
 from pipeprog_bringup.results.results_reader import UNPLANNED, Color
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 
-# The GUIDs that are made of names and ids begin here: the same pipe of a site is the same object in every file.
-_NAMESPACE = uuid.UUID("5c1f0d0e-3a54-4a8e-9d1b-0f7f6c1f2b11")
 _INSTALL = "IFC needs IfcOpenShell: `pip install ifcopenshell==0.9.0.post1` (or `make setup EXCHANGE=1`)"
-_NO_TIME = "2000-01-01T00:00:00+00:00"  # of results that do not tell when they were made
 
 
 def write_ifc(survey: Survey, path: Path) -> None:
     """Writes the pipes as IFC4; raises InputError where IfcOpenShell is not installed."""
     try:
-        import ifcopenshell
+        import ifcopenshell  # noqa: F401
     except ImportError:
         raise InputError(_INSTALL) from None
     model = _Model(survey)
@@ -37,9 +34,9 @@ def write_ifc(survey: Survey, path: Path) -> None:
         model.add(pipe)
     model.add_runs()
     header = model.file.header.file_name
-    header.name, header.time_stamp = "survey.ifc", (survey.finished or _NO_TIME)[:19]
+    header.name, header.time_stamp = "survey.ifc", (survey.finished or NO_TIME)[:19]
     _set_order(model.file)
-    _set_guids(model.file, ifcopenshell.guid)
+    _set_guids(model.file)
     path.write_text(model.file.to_string(), encoding="utf-8")
 
 
@@ -180,10 +177,10 @@ def _set_order(file: Any) -> None:
                 entity[index] = tuple(sorted(value, key=lambda one: int(one.id())))
 
 
-def _set_guids(file: Any, guid: Any) -> None:
+def _set_guids(file: Any) -> None:
     """GUIDs of names: of what has one by its name, of the others by their order, which the results fix."""
     seen: Counter[str] = Counter()
     for entity in file.by_type("IfcRoot"):
         key = f"{entity.is_a()}/{entity.Name or ''}"
         seen[key] += 1
-        entity.GlobalId = guid.compress(uuid.uuid5(_NAMESPACE, f"{key}/{seen[key]}").hex)
+        entity.GlobalId = ifc_guid(f"{key}/{seen[key]}")

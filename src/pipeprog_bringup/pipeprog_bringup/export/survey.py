@@ -16,6 +16,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.product.installed_where_planned import FoundPipe, PlannedState, installed_where_planned
 from pipeprog_detect.types import Cylinder
 
+NO_TIME = "2000-01-01T00:00:00+00:00"  # of results that do not tell when they were made
 _FAR = 10_000.0  # m; beyond, numbers of single precision are 1 mm apart and more
 
 
