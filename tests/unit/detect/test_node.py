@@ -161,7 +161,8 @@ def test_what_a_robot_is_told_is_what_the_files_hold(stage: Callable[..., Stage]
     assert (message.map_revision, message.scale_source, message.scale_sigma) == (7, "board", 0.0004)
 
     boq = load_boq(scene.boq)
-    found = product_of(detect(Cloud(points.astype(float)), boq, DetectConfig(contour=ContourConfig(False))), boq)
+    pipes = detect(Cloud(points.astype(float)), boq, DetectConfig(contour=ContourConfig(False)))
+    found = product_of(pipes, boq, message.scale_sigma)
     assert len(found.pipes) == 3
 
     def file(product: Product) -> str:
