@@ -84,6 +84,8 @@ class RemoteCluster:
     @contextlib.contextmanager
     def __call__(self) -> Iterator[Client]:
         """A client; raises InputError where no scheduler answers."""
+        for name in ("distributed", "distributed.client"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # it prints a traceback at each try to connect
         deadline = time.monotonic() + (_PATIENCE_SECONDS if self._was_there else 0.0)
         while True:
             try:
