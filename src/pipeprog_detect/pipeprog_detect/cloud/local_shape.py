@@ -25,6 +25,8 @@ _FLAT = 0.7
 _ONE_SURFACE = 0.8
 # Root of the Tukey-weighted mean square of Gaussian residuals, cut at four sigma, in sigmas.
 _TUKEY_SHRINKAGE = 0.873
+# Powers of x and y of a quadric's terms 1, x, y, xx, xy, yy.
+_POWERS = np.array([[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]])
 
 
 @dataclass(frozen=True)
@@ -114,30 +116,21 @@ def estimate_noise(tree: Octree, most_cells: int = 20000) -> float:
     return max(float(np.median(clean)) / _TUKEY_SHRINKAGE, tree.quantum) if len(clean) else tree.quantum
 
 
-@njit(cache=True, nogil=True)
-def _quadric_rows(offset: FloatArray, frame: FloatArray, scale: float) -> tuple[float, float, float]:
-    x = (offset[0] * frame[0, 0] + offset[1] * frame[0, 1] + offset[2] * frame[0, 2]) / scale
-    y = (offset[0] * frame[1, 0] + offset[1] * frame[1, 1] + offset[2] * frame[1, 2]) / scale
-    z = (offset[0] * frame[2, 0] + offset[1] * frame[2, 1] + offset[2] * frame[2, 2]) / scale
-    return x, y, z
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _principal(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean, standard deviations ascending, and principal directions as rows (normal first)."""
+    count = len(points)
     mean = np.zeros(3)
-    for i in range(len(points)):
-        mean += points[i]
-    mean /= len(points)
-    scatter = np.zeros((3, 3))
-    for i in range(len(points)):
-        for a in range(3):
-            for b in range(a, 3):
-                scatter[a, b] += (points[i, a] - mean[a]) * (points[i, b] - mean[b])
-    for a in range(3):
-        for b in range(a):
-            scatter[a, b] = scatter[b, a]
-    values, vectors = np.linalg.eigh(scatter / len(points))
+    for i in range(count):
+        for k in range(3):
+            mean[k] += points[i, k]
+    mean /= count
+    xx = xy = xz = yy = yz = zz = 0.0
+    for i in range(count):
+        x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
+        xx, xy, xz, yy, yz, zz = xx + x * x, xy + x * y, xz + x * z, yy + y * y, yz + y * z, zz + z * z
+    scatter = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    values, vectors = np.linalg.eigh(scatter / count)
     return mean, np.sqrt(np.maximum(values, 0.0)), np.ascontiguousarray(vectors.T)
 
 
@@ -146,46 +139,64 @@ def _solve_quadric(
     points: FloatArray, origin: FloatArray, frame: FloatArray, scale: float, sigma: float, rounds: int
 ) -> tuple[FloatArray, float, float, float]:
     """Weighted z = q . (1, x, y, xx, xy, yy) in units of scale; returns q, rms [m], inlier share, variance of xx."""
+    count = len(points)
+    local = np.empty((3, count))
+    for i in range(count):
+        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        for k in range(3):
+            local[k, i] = (x * frame[k, 0] + y * frame[k, 1] + z * frame[k, 2]) / scale
     q: FloatArray = np.zeros(6)
     rms, share, variance = 0.0, 0.0, 0.0
-    row = np.empty(6)
     for turn in range(rounds):
-        normal = np.zeros((6, 6))
-        right = np.zeros(6)
         # Four sigma after a first plain round; wide at first, since the plane is not yet the surface.
-        reach = 4.0 * sigma * (2.0 if turn == 1 else 1.0) / scale
-        total, square, weights = 0, 0.0, 0.0
-        for i in range(len(points)):
-            x, y, z = _quadric_rows(points[i] - origin, frame, scale)
-            row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, x, y, x * x, x * y, y * y
-            weight = 1.0
-            if turn > 0:
-                d = z
-                for a in range(6):
-                    d -= q[a] * row[a]
-                t = d / reach
-                if t * t >= 1.0:
-                    continue
-                weight = (1.0 - t * t) ** 2
-                square += weight * d * d
-                weights += weight
-            total += 1
-            for a in range(6):
-                right[a] += weight * row[a] * z
-                for b in range(a, 6):
-                    normal[a, b] += weight * row[a] * row[b]
+        reach = 4.0 * sigma * (2.0 if turn == 1 else 1.0) / scale if turn > 0 else np.inf
+        total, square, moments, right = _quadric_sums(local, q, reach)
         if total < 8:
             return q, 0.0, 0.0, 0.0
+        normal = np.empty((6, 6))
         for a in range(6):
+            for b in range(6):
+                normal[a, b] = moments[_POWERS[a, 0] + _POWERS[b, 0], _POWERS[a, 1] + _POWERS[b, 1]]
             normal[a, a] += 1e-9 * total
-            for b in range(a):
-                normal[a, b] = normal[b, a]
         inverse = np.linalg.inv(normal)
         q = np.dot(inverse, right)
-        rms = scale * np.sqrt(square / max(weights, 1e-12))
-        share = total / len(points)
+        rms = scale * np.sqrt(square / max(moments[0, 0], 1e-12)) if turn > 0 else 0.0
+        share = total / count
         variance = max(inverse[3, 3], inverse[5, 5])
     return q, rms, share, variance
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _quadric_sums(local: FloatArray, q: FloatArray, reach: float) -> tuple[int, float, FloatArray, FloatArray]:
+    """Sums over points (3, N) within `reach` of the quadric q, by Tukey's weights.
+
+    Their number, the weighted squares of their distances, the weighted moments x^a y^b (5, 5) for a + b <= 4, and the
+    weighted sums (6,) of z times 1, x, y, xx, xy, yy.
+    """
+    total, square = 0, 0.0
+    m00 = m10 = m01 = m20 = m11 = m02 = m30 = m21 = m12 = m03 = m40 = m31 = m22 = m13 = m04 = 0.0
+    r0 = r1 = r2 = r3 = r4 = r5 = 0.0
+    for i in range(local.shape[1]):
+        x, y, z = local[0, i], local[1, i], local[2, i]
+        xx, xy, yy = x * x, x * y, y * y
+        d = z - q[0] - q[1] * x - q[2] * y - q[3] * xx - q[4] * xy - q[5] * yy
+        t = d / reach
+        inner = max(1.0 - t * t, 0.0)
+        w = inner * inner
+        total += 1 if inner > 0.0 else 0
+        square += w * d * d
+        m00, m10, m01, m20, m11, m02 = m00 + w, m10 + w * x, m01 + w * y, m20 + w * xx, m11 + w * xy, m02 + w * yy
+        m30, m21, m12, m03 = m30 + w * xx * x, m21 + w * xx * y, m12 + w * x * yy, m03 + w * yy * y
+        m40, m31, m22 = m40 + w * xx * xx, m31 + w * xx * xy, m22 + w * xx * yy
+        m13, m04 = m13 + w * xy * yy, m04 + w * yy * yy
+        v = w * z
+        r0, r1, r2, r3, r4, r5 = r0 + v, r1 + v * x, r2 + v * y, r3 + v * xx, r4 + v * xy, r5 + v * yy
+    moments = np.zeros((5, 5))
+    moments[0, 0], moments[1, 0], moments[0, 1] = m00, m10, m01
+    moments[2, 0], moments[1, 1], moments[0, 2] = m20, m11, m02
+    moments[3, 0], moments[2, 1], moments[1, 2], moments[0, 3] = m30, m21, m12, m03
+    moments[4, 0], moments[3, 1], moments[2, 2], moments[1, 3], moments[0, 4] = m40, m31, m22, m13, m04
+    return total, square, moments, np.array([r0, r1, r2, r3, r4, r5])
 
 
 @njit(cache=True, nogil=True)

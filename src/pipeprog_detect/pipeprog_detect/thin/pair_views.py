@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import project
+from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, project
 from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line
 from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
@@ -120,21 +121,16 @@ def _cloud_depths(
     for number in range(len(found)):
         ends, width = found.ends[number], float(found.width[number].mean())
         reach = BESIDE_REACH * width
-        near = ((pixel > ends.min(axis=0) - reach) & (pixel < ends.max(axis=0) + reach)).all(axis=1)
-        along = ends[1] - ends[0]
-        length = float(np.linalg.norm(along))
-        along = along / length
-        offset = pixel[near] - ends[0]
-        place, aside = offset @ along, offset @ np.array([-along[1], along[0]])
-        within = (place > 0) & (place < length)
+        length = float(np.linalg.norm(ends[1] - ends[0]))
+        place, aside, there = _along(pixel, depth, ends, length, reach)
         bins = max(int(length / max(width, 6.0)), 3)
-        cell = np.clip((place / length * bins).astype(int), 0, bins - 1)
-        inner = within & (np.abs(aside) < 0.35 * width)
-        front = by_bin(cell[inner], depth[near][inner], bins, 30.0)
+        cell = np.minimum((place / length * bins).astype(np.int64), bins - 1)
+        inner = np.abs(aside) < 0.35 * width
+        front = by_bin(cell[inner], there[inner], bins, 30.0)
         flanks = []
         for side in (-1.0, 1.0):
-            beside = within & (side * aside > 1.2 * width) & (side * aside < reach)
-            flanks.append(by_bin(cell[beside], depth[near][beside], bins, 50.0))
+            beside = side * aside > 1.2 * width
+            flanks.append(by_bin(cell[beside], there[beside], bins, 50.0))
         known = np.isfinite(front)
         if known.sum() < 0.5 * bins:
             continue
@@ -154,15 +150,46 @@ def _cloud_depths(
 
 def _points_in(view: View, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pixels (M, 2) and depths (M,) [m] of those points (N, 3) that lie within the view."""
-    pose = view.camera_from_map.astype(np.float32)
     camera = view.camera
-    depth = points @ pose[2, :3] + pose[2, 3]
-    front = depth > 0.05
-    points, depth = points[front], depth[front]
-    x = camera.fx * (points @ pose[0, :3] + pose[0, 3]) / depth + camera.cx
-    y = camera.fy * (points @ pose[1, :3] + pose[1, 3]) / depth + camera.cy
-    inside = (x > 0) & (y > 0) & (x < camera.width - 1) & (y < camera.height - 1)
-    return np.stack([x[inside], y[inside]], axis=1), depth[inside]
+    matrix = (camera.matrix @ view.camera_from_map[:3]).astype(np.float32)
+    return _projected_points(points, matrix, camera.width, camera.height)
+
+
+@njit(cache=True, nogil=True)
+def _projected_points(
+    points: NDArray[np.float32], matrix: NDArray[np.float32], width: int, height: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """See `_points_in`; `matrix` (3, 4): pixels and depth, times depth, from the map."""
+    pixel, depth = np.empty((len(points), 2), np.float32), np.empty(len(points), np.float32)
+    count = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        far = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+        if far <= np.float32(NEAR_PLANE):
+            continue
+        u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / far
+        v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / far
+        if u > 0 and v > 0 and u < width - 1 and v < height - 1:
+            pixel[count, 0], pixel[count, 1], depth[count] = u, v, far
+            count += 1
+    return pixel[:count].copy(), depth[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _along(
+    pixel: NDArray[np.float32], depth: NDArray[np.float32], ends: FloatArray, length: float, reach: float
+) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
+    """Of the pixels (M, 2) within `reach` of a segment (2, 2): place along it and aside [px], and depth [m] (N,)."""
+    place, aside, there = np.empty(len(pixel)), np.empty(len(pixel)), np.empty(len(pixel), np.float32)
+    ax, ay = (ends[1, 0] - ends[0, 0]) / length, (ends[1, 1] - ends[0, 1]) / length
+    count = 0
+    for i in range(len(pixel)):
+        x, y = pixel[i, 0] - ends[0, 0], pixel[i, 1] - ends[0, 1]
+        at, off = x * ax + y * ay, y * ax - x * ay
+        if 0.0 < at < length and abs(off) < reach:
+            place[count], aside[count], there[count] = at, off, depth[i]
+            count += 1
+    return place[:count].copy(), aside[:count].copy(), there[:count].copy()
 
 
 def _within_silhouette(found: SegmentPairs, cylinder: Cylinder, view: View) -> NDArray[np.bool_]:
