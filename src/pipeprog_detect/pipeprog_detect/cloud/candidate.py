@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.axial_extent import Interval, straight_interval, surface_intervals
 from pipeprog_detect.cloud.axis_voting import Hypothesis, Sector
-from pipeprog_detect.cloud.cylinder_fit import CylinderFit, basis, covered_arc, fit_cylinder
+from pipeprog_detect.cloud.cylinder_fit import CylinderFit, basis, covered_arc, fit_cylinder, quick_fit
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.types import Cylinder
 
@@ -111,11 +111,12 @@ def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis,
             cylinder = cylinder.cut(low, high)
             points = _between(points, cylinder, Interval(0.0, cylinder.length))
         facing = _spread_out(_facing(points, cylinder, hypothesis.sector), _FIT_POINTS)
-        fit = fit_cylinder(facing, cylinder, wide, reach=reach, along_ray=False)
-        if fit is None or not 0.6 * initial.radius < fit.cylinder.radius < 1.6 * initial.radius:
+        fit = quick_fit(facing, cylinder, wide, reach)
+        if fit is None or not 0.6 * initial.radius < fit[0].radius < 1.6 * initial.radius:
             return None
-        wide = float(np.clip(1.2 * fit.rmse, _band(sigma, _LEAST_BAND), _band(sigma, _MOST_BAND)))
-        cylinder = fit.cylinder if turn == 0 else fit.cylinder.cut_like(cylinder)
+        fitted, rmse = fit
+        wide = float(np.clip(1.2 * rmse, _band(sigma, _LEAST_BAND), _band(sigma, _MOST_BAND)))
+        cylinder = fitted if turn == 0 else fitted.cut_like(cylinder)
         if grown < 0.02 and turn >= 2:
             break
     margin = cylinder.radius * cylinder.axis
@@ -171,13 +172,13 @@ def thin_pipe_start(
         for angle in np.arange(8) * (np.pi / 4):
             shift = 0.6 * radius * (np.cos(angle) * u + np.sin(angle) * v)
             initial = Cylinder(line.start + shift, line.end + shift, radius)
-            fit = fit_cylinder(points, initial, sigma, reach=1.0, along_ray=False)
-            if fit is None or not 0.5 * min(radii) < fit.cylinder.radius < 1.5 * max(radii):
+            fit = quick_fit(points, initial, sigma, 1.0)
+            if fit is None or not 0.5 * min(radii) < fit[0].radius < 1.5 * max(radii):
                 continue
-            share = np.clip(1.0 - (_signed_distance(points, fit.cylinder) / (4.0 * sigma)) ** 2, 0.0, None)
+            share = np.clip(1.0 - (_signed_distance(points, fit[0]) / (4.0 * sigma)) ** 2, 0.0, None)
             worth = float((share**2).sum())
             if worth > most:
-                best, most = fit.cylinder, worth
+                best, most = fit[0], worth
     return best
 
 

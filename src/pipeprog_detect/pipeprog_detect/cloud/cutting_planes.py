@@ -14,7 +14,7 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.cloud import local_shape
 from pipeprog_detect.cloud.axis_voting import Hypothesis, line_votes, patch_votes
-from pipeprog_detect.cloud.cylinder_fit import basis, fit_cylinder
+from pipeprog_detect.cloud.cylinder_fit import basis, quick_fit
 from pipeprog_detect.cloud.ellipse_search import Ellipse, find_ellipses
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.types import Cylinder
@@ -191,8 +191,8 @@ def _turned(ellipse: Ellipse, plane: CuttingPlane) -> list[Cylinder]:
 
 def _straightened(points: FloatArray, turned: Sequence[Cylinder], sigma: float) -> list[Cylinder]:
     """The cylinders again, each fitted to the points (N, 3) of the slab as what they are: a short piece of a pipe."""
-    fits = [fit_cylinder(points, start, sigma, along_ray=False) for start in turned]
-    return [fit.cylinder for fit in fits if fit is not None]
+    fits = [quick_fit(points, start, sigma, 4.0) for start in turned]
+    return [fit[0] for fit in fits if fit is not None]
 
 
 def _circle(

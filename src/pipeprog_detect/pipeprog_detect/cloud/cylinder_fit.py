@@ -33,14 +33,13 @@ class CylinderFit:
     """A fitted cylinder.
 
     covariance (5, 5) of (centre u, centre v, axis u, axis v, radius) in the frame of `basis(axis)` at the middle of
-    the axis [m, rad]; rmse [m] of the inliers; inliers (N,) of the given points; arc [rad] that they cover.
+    the axis [m, rad]; rmse [m] of the inliers; inliers (N,) of the given points.
     """
 
     cylinder: Cylinder
     covariance: FloatArray
     rmse: float
     inliers: NDArray[np.bool_]
-    arc: float
 
     @property
     def radius_sigma(self) -> float:
@@ -65,7 +64,6 @@ def fit_cylinder(
     *,
     fixed_radius: float | None = None,
     reach: float = 4.0,
-    along_ray: bool = True,
 ) -> CylinderFit | None:
     """Fit a cylinder to points (N, 3) [m] near `initial`; None where fewer than ten of them agree with one.
 
@@ -77,8 +75,7 @@ def fit_cylinder(
     Noise of cameras and scanners lies along the ray, so it moves a point across and along the surface together, and
     the plain geometric radius is too small by several noise variances over the radius. So the noise tensor of the
     section is estimated from the residuals over the angle, distances are taken in its metric (for noise along the
-    ray: along the ray), and the outward bias that a bent surface gives them is subtracted. Without `along_ray` that
-    is left out: quicker, for a start.
+    ray: along the ray), and the outward bias that a bent surface gives them is subtracted.
     """
     if len(points) < 10 or not sigma > 0:
         return None
@@ -87,7 +84,7 @@ def fit_cylinder(
     free_radius = fixed_radius is None
     tensor = sigma**2 * np.eye(3)
     ok, centre, axis, radius = _iterate(points, middle, initial.axis, radius, tensor, reach, free_radius, False)
-    for _ in range(_TENSOR_ROUNDS if along_ray else 0):
+    for _ in range(_TENSOR_ROUNDS):
         if not ok or not np.isfinite(centre).all() or radius <= 0:
             return None
         tensor = _noise_tensor(points, centre, axis, radius, tensor, sigma)
@@ -95,20 +92,38 @@ def fit_cylinder(
     if not ok or not np.isfinite(centre).all() or radius <= 0:
         return None
     offset = points - centre
-    along = offset @ axis
-    radial = offset - along[:, None] * axis
-    distance = np.linalg.norm(radial, axis=1) - radius
-    weight, foot, residual, spread = _weights(offset, axis, radius, tensor, along_ray)
+    weight, foot, residual, spread = _weights(offset, axis, radius, tensor)
     inliers = np.asarray((weight > 0) & (np.abs(residual) < 3.0 * spread))
     if inliers.sum() < 10:
         return None
-    low, high = np.quantile(along[inliers], [0.0, 1.0])
-    centre = centre + 0.5 * (low + high) * axis
-    half = 0.5 * (high - low) * axis
-    cylinder = Cylinder(centre - half, centre + half, float(radius))
-    covariance = _sandwich(offset, axis, foot, residual, weight / spread**2, float(high - low), fixed_radius is None)
-    rmse = float(np.sqrt(np.mean(distance[inliers] ** 2)))
-    return CylinderFit(cylinder, covariance, rmse, inliers, covered_arc(points[inliers], cylinder))
+    cylinder, rmse = _between_inliers(offset[inliers], centre, axis, radius)
+    covariance = _sandwich(offset, axis, foot, residual, weight / spread**2, cylinder.length, fixed_radius is None)
+    return CylinderFit(cylinder, covariance, rmse, inliers)
+
+
+def quick_fit(points: FloatArray, initial: Cylinder, sigma: float, reach: float) -> tuple[Cylinder, float] | None:
+    """The cylinder that `fit_cylinder` starts from, with noise of `sigma` [m] all around, and its inliers' rmse [m]."""
+    if len(points) < 10 or not sigma > 0:
+        return None
+    tensor = sigma**2 * np.eye(3)
+    ok, centre, axis, radius = _iterate(
+        points, initial.middle, initial.axis, initial.radius, tensor, reach, True, False
+    )
+    if not ok or not np.isfinite(centre).all() or radius <= 0:
+        return None
+    offset = points - centre
+    distance = np.abs(np.linalg.norm(offset - (offset @ axis)[:, None] * axis, axis=1) - radius)
+    inliers = distance < 3.0 * sigma
+    return _between_inliers(offset[inliers], centre, axis, radius) if inliers.sum() >= 10 else None
+
+
+def _between_inliers(offset: FloatArray, centre: FloatArray, axis: FloatArray, radius: float) -> tuple[Cylinder, float]:
+    """The cylinder as long as its points (N, 3), given from `centre`, and their distances' root mean square [m]."""
+    along = offset @ axis
+    low, high = float(along.min()), float(along.max())
+    distance = np.linalg.norm(offset - along[:, None] * axis, axis=1) - radius
+    cylinder = Cylinder(centre + low * axis, centre + high * axis, float(radius))
+    return cylinder, float(np.sqrt(np.mean(distance**2)))
 
 
 def covered_arc(points: FloatArray, cylinder: Cylinder, bins: int = 72) -> float:
@@ -158,17 +173,13 @@ def _noise_tensor(
 
 
 def _weights(
-    offset: FloatArray, axis: FloatArray, radius: float, tensor: FloatArray, along_ray: bool
+    offset: FloatArray, axis: FloatArray, radius: float, tensor: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Tukey weights (N,), feet on the unit circle (N, 2), residuals across it [m] and their standard deviation [m]."""
     u, v = basis(axis)
     x, y = offset @ u, offset @ v
     muu, muv, mvv = u @ tensor @ u, u @ tensor @ v, v @ tensor @ v
-    if along_ray:
-        cosine, sine, residual = _feet(x, y, radius, muu, muv, mvv)
-    else:
-        rho = np.hypot(x, y) + 1e-12
-        cosine, sine, residual = x / rho, y / rho, rho - radius
+    cosine, sine, residual = _feet(x, y, radius, muu, muv, mvv)
     spread = np.sqrt(cosine**2 * muu + 2 * cosine * sine * muv + sine**2 * mvv)
     weight = np.clip(1.0 - (residual / (_CUT * spread)) ** 2, 0.0, None) ** 2
     return weight, np.stack([cosine, sine], axis=1), residual, spread

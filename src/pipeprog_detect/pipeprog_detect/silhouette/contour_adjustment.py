@@ -25,8 +25,9 @@ WORST_EDGE = 0.7
 MODEL_ERROR = 0.05
 # Rounds of the robust weights, and standard deviation of the views' offsets [px] in the first and at the least.
 ROUNDS, FIRST_OFFSET, LEAST_OFFSET = 25, 0.5, 0.02
-# Distance of edges from the contour of the search, and from the refined one [px], and passes over the latter.
-COARSE_REACH, FINE_REACH, FINE_PASSES = 2.5, 1.5, 3
+# Distance of edges from the contour of the search, and from the refined one [px], and most passes over the latter: they
+# end when one moves the contour by less than half of `FLOOR`, for its edges would be the same again [px rms].
+COARSE_REACH, FINE_REACH, FINE_PASSES, SETTLED = 2.5, 1.5, 3, 0.05
 # Samples that a candidate step is judged by, and the least that measure a cylinder (five unknowns, four of each).
 COARSE_SAMPLES, MIN_SAMPLES = 1200, 20
 
@@ -72,7 +73,10 @@ def adjusted(scene: Scene, prior: FloatArray, so_far: FloatArray) -> AdjustedCyl
             return None
         samples, edges, solution = found
         step = step + solution.step
+        moved = solution.displacement - scene.shift_of(samples)
         scene = replace(scene, view_offset=solution.view_offset)
+        if float(np.sqrt(np.mean(moved**2))) < SETTLED:
+            break
     scene = scene.moved(step)
     if scene.cylinder.radius <= 0:
         return None

@@ -106,7 +106,7 @@ def by_bin(cell: NDArray[np.int64], depth: NDArray[np.floating], bins: int, perc
     starts = np.zeros(bins + 1, np.int64)
     for i in range(len(cell)):
         starts[cell[i] + 1] += 1
-    starts = np.cumsum(starts)
+    starts[:] = np.cumsum(starts)
     filled = starts[:bins].copy()
     ordered = np.empty(len(cell))
     for i in range(len(cell)):
