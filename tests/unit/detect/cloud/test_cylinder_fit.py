@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.cylinder_fit import basis, covered_arc, fit_cylinder
+from pipeprog_detect.cloud.cylinder_fit import basis, covered_arc, fit_cylinder, quick_fit
 from pipeprog_detect.types import Cylinder
 
 LENGTH = 0.5
@@ -96,3 +96,18 @@ def test_too_few_points_are_no_cylinder() -> None:
     barrel = Cylinder(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.05)
     assert fit_cylinder(np.zeros((5, 3)), barrel, 1e-3) is None
     assert fit_cylinder(np.full((50, 3), 9.0), barrel, 1e-3) is None
+
+
+def test_a_quick_fit_is_near_the_fit_that_it_starts() -> None:
+    points = pipe(np.random.default_rng(11), 0.04, 1e-3)
+    quick, fit = (
+        quick_fit(points, start(0.04, 2.0, 2e-3, 0.003), 1e-3, 4.0),
+        fit_cylinder(points, start(0.04, 0.0, 1e-3, 0.0), 1e-3),
+    )
+    assert quick is not None
+    assert fit is not None
+    cylinder, rmse = quick
+    # Noise along the ray draws the plain geometric radius in by several of its variances over the radius.
+    assert cylinder.radius == pytest.approx(fit.cylinder.radius, abs=2e-4)
+    assert rmse == pytest.approx(fit.rmse, rel=0.05)
+    assert quick_fit(np.full((50, 3), 9.0), start(0.04, 0.0, 1e-3, 0.0), 1e-3, 4.0) is None
