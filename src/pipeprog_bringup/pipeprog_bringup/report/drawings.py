@@ -207,8 +207,10 @@ class _Frame:
                 place = (value - self.low[axis]) * self.scale + (LEFT, BOTTOM)[axis]
                 if axis == 0:
                     axes.plot([place, place], [BOTTOM, top], color="#dde1e7", lw=0.6, zorder=0)
-                    axes.text(place, BOTTOM - 11, f"{value:g}", fontsize=FONT, ha="center")
+                    axes.text(place, BOTTOM - 11, f"{round(float(value), 1) + 0.0:g}", fontsize=FONT, ha="center")
                 else:
                     axes.plot([LEFT, WIDTH - BORDER], [place, place], color="#dde1e7", lw=0.6, zorder=0)
-                    axes.text(LEFT - 4, place, f"{value:g}", fontsize=FONT, ha="right", va="center")
+                    axes.text(
+                        LEFT - 4, place, f"{round(float(value), 1) + 0.0:g}", fontsize=FONT, ha="right", va="center"
+                    )
         axes.text(LEFT, 6, "metres", fontsize=FONT)
