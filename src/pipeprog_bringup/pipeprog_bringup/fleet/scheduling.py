@@ -106,7 +106,7 @@ def run(tasks: Sequence[Task], connect: Connect, runner: Runner, tell: Tell) -> 
     """The outcome of each task, as they come; `tell` gets the states of the surveys that run.
 
     A task whose worker died runs again; where that has happened as often as Dask allows (`allowed-failures`, 3), it
-    runs once more on a worker of its own, so that one that kills its workers takes no other with it. One that failed
+    runs at the end with no other beside it, so that one that kills its workers takes no other with it. One that failed
     otherwise is tried twice. A cluster whose scheduler is lost is connected to again, and what is left given to it.
     Raises InputError where the cluster cannot be used.
     """
@@ -128,7 +128,8 @@ class _Session:
         self._waiting = deque(tasks)
         self._running: dict[Future, Task] = {}
         self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._alone: set[str] = set()
+        self._suspects: deque[Task] = deque()  # their workers have died too often; one of them may be the reason
+        self._alone: set[str] = set()  # of them those that have run with no other beside them
         self._logs: dict[str, str] = {}
         self._staffed = time.monotonic()  # when there was a worker
 
@@ -139,7 +140,7 @@ class _Session:
         """
         self._client.subscribe_topic(_TOPIC, lambda event: self._hear(event[1]))
         try:
-            while self._waiting or self._running:
+            while self._waiting or self._running or self._suspects:
                 self._submit(self._offers())
                 try:
                     future = self._ended.get(timeout=_POLL_SECONDS)
@@ -152,9 +153,7 @@ class _Session:
                     return
                 outcome = self._outcome(future, task)
                 future.release()
-                if outcome is None:
-                    self._waiting.append(task)
-                else:
+                if outcome is not None:
                     yield outcome
         finally:
             with contextlib.suppress(OSError, RuntimeError, TimeoutError):
@@ -183,9 +182,12 @@ class _Session:
                 f"the workers of this cluster offer no '{SLOT}': start them with --resources \"{SLOT}=1 {MEMORY}=8000\""
             )
         room = max((offer[MEMORY] for offer in offers if MEMORY in offer), default=None)
+        if self._suspects and not self._waiting and not self._running:
+            self._waiting.append(self._suspects.popleft())
+            self._alone.add(self._waiting[0].name)
         while self._waiting and len(self._running) < max(1, sum(slots)):
             task = self._waiting.popleft()
-            needed: dict[str, float] = {SLOT: max(slots) if task.name in self._alone and slots else 1}
+            needed: dict[str, float] = {SLOT: 1}
             if room is not None:
                 needed[MEMORY] = min(task.memory, room)  # of a worker that is too small for it, it gets all
             key = f"survey-{task.name}-{time.monotonic_ns()}"  # never that of an earlier try, which may be cancelled
@@ -196,7 +198,9 @@ class _Session:
     def _outcome(self, future: Future, task: Task) -> Outcome | None:
         """What a future came to; None where its task goes back to wait."""
         if future.status == "finished":
-            outcome: Outcome = future.result()
+            outcome: Outcome | None = future.result()
+            if outcome is None:  # unwanted: its worker was closing
+                self._waiting.append(task)
             return outcome
         error = future.exception()
         if not isinstance(error, KilledWorker):
@@ -204,9 +208,9 @@ class _Session:
             return Outcome(task.name, "failed", reason, log)
         log = self._logs.get(task.name, "")
         if task.name not in self._alone:
-            self._alone.add(task.name)
+            self._suspects.append(task)
             return None
-        reason = "its worker died whenever it ran, at last on a worker of its own"
+        reason = "its worker died whenever it ran, at last with no other survey beside it"
         return Outcome(task.name, "failed", reason, log)
 
     def _hear(self, state: dict[str, Any]) -> None:
