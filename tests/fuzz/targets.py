@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from datetime import date
 from functools import cache, partial
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 from rclpy.serialization import deserialize_message, serialize_message
 
+from pipeprog_bringup.export.control_points import load_control_points
 from pipeprog_bringup.ingest import read_camera
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
@@ -39,6 +41,7 @@ from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_boq
+from pipeprog_detect.types import Cylinder
 from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_node import received
 from pipeprog_sfm.boards.board_file import load_board_file
@@ -46,6 +49,7 @@ from tests.fuzz.attempts import Target
 from tests.fuzz.fuzzed_messages import IMAGES, fuzzed_message, good_messages
 from tests.fuzz.mutated_bytes import mutated
 from tests.unit.bringup.recordings import START, camera_messages, info, jpeg, mcap_bytes, raw_image, sqlite_bytes
+from tests.unit.detect.plan.ifc_site import write_plan_ifc
 
 ROOT = Path(__file__).parents[2]
 # What people and adversaries write where a number, a name or a list should stand.
@@ -113,12 +117,15 @@ def targets() -> dict[str, Target]:
         Target("boq", ".yaml", partial(_spoiled_text, _boqs), load_boq),
         Target("boq_csv", ".csv", partial(_spoiled_text, _bill_tables), load_boq),
         Target("boq_xlsx", ".xlsx", partial(_damaged, _workbooks), load_boq),
+        Target("points", ".yaml", partial(_spoiled_text, _control_points), load_control_points),
         Target("board", ".yaml", partial(_spoiled_text, _boards), load_board_file),
         Target("calibration", ".yaml", partial(_spoiled_text, _calibrations), read_camera),
         Target("metadata", ".yaml", partial(_spoiled_text, _metadata), _read_folder),
         Target("image", ".jpg", partial(_damaged, _images), _read_image),
         Target("cdr", ".cdr", partial(_damaged, _recorded_messages), _read_cdr),
     ]
+    if find_spec("ifcopenshell") is not None:
+        files.append(Target("ifc", ".ifc", partial(_spoiled_text, _ifc_plans), load_boq))
     clouds = [Target(name, f".{name}", partial(_damaged, partial(_clouds, name)), read_cloud) for name in CLOUDS]
     types: dict[str, Any] = {type(message).__name__: type(message) for message in good_messages(0).values()}
     doors = [
@@ -174,6 +181,29 @@ def _bill_tables() -> list[bytes]:
     english = "name,outer diameter [mm],planned length [m],zone\nA,60.3,1906.5,1\nB,114.3,8.60,2\n"
     german = "Bezeichnung;Durchmesser (mm);L\u00e4nge (m);Beginn\nA;60,3;1.906,5;1.3.2026\nB;114,3;8,60;\n"
     return [english.encode(), german.encode("utf-8-sig")]
+
+
+@cache
+def _control_points() -> list[bytes]:
+    rows = [f"- {{name: P{k}, circle: A/{k}, xyz: [{k}, 2, 3.5]}}" for k in range(1, 5)]
+    circles = "\n".join(["points:", *rows, ""])
+    return [circles.encode(), f"{circles}- {{name: P5, pixel: [[1, 2.5, 3], [2, 4, 5]], xyz: [1, 2, 3]}}\n".encode()]
+
+
+@cache
+def _ifc_plans() -> list[bytes]:
+    """Plans with bodies of their own and with mapped ones."""
+    pipes = [
+        (name, "DN100", Cylinder(np.array([k, 0.0, 0.0]), np.array([k + 2.0, 0.0, 1.0]), 0.05715))
+        for k, name in enumerate(("a", "b"))
+    ]
+    content = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "plan.ifc"
+        for mapped in (False, True):
+            write_plan_ifc(path, pipes, mapped=mapped, systems={"a": "heating", "b": "water"})
+            content.append(path.read_bytes())
+    return content
 
 
 @cache

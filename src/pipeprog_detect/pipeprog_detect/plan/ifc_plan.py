@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plan in IFC: its straight pipes with their places, summed up to the lines of a bill of quantities.
 
-The one module of the plan that imports IfcOpenShell, which is an extra.
+The one module of the plan that imports IfcOpenShell, which is an extra; it does so in a child process, since damaged
+files can end the process that reads them.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -45,23 +51,54 @@ def ifc_entries(path: Path) -> list[Entry]:
     require_regular(path)
     if path.stat().st_size > MAX_IFC:
         raise InputError(f"{path} is larger than {MAX_IFC >> 20} MiB: export the pipes' discipline alone")
-    try:
-        import ifcopenshell
-    except ImportError:
-        raise InputError(f"{path}: {_INSTALL}") from None
-    try:
-        straights = _straights(ifcopenshell.open(str(path)))
-    except MemoryError:
-        raise InputError(f"{path} does not fit into memory: export the pipes' discipline alone") from None
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    # IfcOpenShell raises exceptions of any type for files that break the schema.
-    except Exception as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        raise InputError(f"{path} cannot be read as IFC ({reason}): export it again as IFC4") from None
+    if find_spec("ifcopenshell") is None:
+        raise InputError(f"{path}: {_INSTALL}")
+    straights = _read_in_child(path)
     if not straights:
         raise InputError(f"{path} holds no straight pipe (IfcPipeSegment with a round body): export pipes as solids")
     return _entries(str(path), straights)
+
+
+def _read_in_child(path: Path) -> list[_Straight]:
+    """The pipes of a file, read in a process of its own, which damage to the file may end."""
+    child = subprocess.run(
+        [sys.executable, "-c", f"from {__name__} import _serve; _serve()", str(path)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        check=False,
+    )
+    try:
+        answer = json.loads(child.stdout.splitlines()[-1])
+        problem, rows = answer["problem"], answer["pipes"]
+    except (IndexError, KeyError, TypeError, ValueError):
+        problem, rows = f"cannot be read as IFC (its reader ended with code {child.returncode}): export it again", []
+    if problem:
+        raise InputError(f"{path} {problem}")
+    return [
+        _Straight(Segment(identity, name, np.array(start), np.array(end)), radius, kind, tuple(place), tuple(days))
+        for identity, name, start, end, radius, kind, place, days in rows
+    ]
+
+
+def _serve() -> None:
+    """The child: writes what is wrong, or the pipes, as a line of JSON."""
+    import ifcopenshell
+
+    problem, pipes = "", []
+    try:
+        for one in _straights(ifcopenshell.open(sys.argv[1])):
+            ends = one.segment.start.tolist(), one.segment.end.tolist()
+            pipes.append([one.segment.id, one.segment.name, *ends, one.radius, one.type_name, one.place, one.days])
+    except MemoryError:
+        problem = "does not fit into memory: export the pipes' discipline alone"
+    except InputError as error:
+        problem = f"cannot be used: {error}"
+    # IfcOpenShell raises exceptions of any type for files that break the schema.
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+        problem = f"cannot be read as IFC ({reason}): export it again as IFC4"
+    sys.stdout.write("\n" + json.dumps({"problem": problem, "pipes": [] if problem else pipes}) + "\n")
 
 
 def _entries(path: str, straights: Sequence[_Straight]) -> list[Entry]:

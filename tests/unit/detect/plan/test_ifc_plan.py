@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -75,4 +76,13 @@ def test_without_ifcopenshell_it_says_how_to_get_it(tmp_path: Path, monkeypatch:
     monkeypatch.setitem(sys.modules, "ifcopenshell", None)
     (tmp_path / "plan.ifc").write_text("ISO-10303-21;")
     with pytest.raises(InputError, match="pip install ifcopenshell=="):
+        load_boq(tmp_path / "plan.ifc")
+
+
+@needs_ifc
+def test_a_file_that_ends_the_reader_s_process_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "plan.ifc").write_text("ISO-10303-21;")
+    ended = subprocess.CompletedProcess([], -11, b"", b"")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: ended)
+    with pytest.raises(InputError, match=r"plan\.ifc cannot be read as IFC \(its reader ended with code -11\)"):
         load_boq(tmp_path / "plan.ifc")
