@@ -35,9 +35,12 @@ from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, i
 # a site has thin pipes cost time only.
 MOST_PROPOSED, MOST_POINTS = 40, 600_000
 # Without support by the cloud, this support of the contour is required, and half of it on each side separately: the
-# edge of a duct, whose faces differ in brightness, is one side, with texture for the other. What runs parallel to known
-# pipes, with the lines of four views along it, has evidence beside its contour, as a candidate of the cloud has.
-LINES_CONVINCING, PARALLEL_CONVINCING = 0.6, CONVINCING
+# edge of a duct, whose faces differ in brightness, is one side, with texture for the other.
+LINES_CONVINCING = (0.6, 0.3)
+# What runs parallel to known pipes has other evidence beside its contour, as a candidate of the cloud has. Where no fit
+# has half of it on each side, the segment pairs have still shown both sides in four views: then each must be seen
+# better than texture, whose support is 0.11 at the most (`edge_support`).
+PARALLEL_CONVINCING = ((CONVINCING, 0.5 * CONVINCING), (CONVINCING, 0.11))
 # Standard deviation of the distance of a pipe found by its lines [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
 # The axes of pipes side by side are at least two radii apart.
@@ -126,12 +129,13 @@ class _LineFitter:
 
         A shadow along it is taken for one of its sides where no planned radius results: then its own one is held.
         """
-        for fixed in (False, True):
-            begin = Start(start, start.radius, True, depth_sigma, PARALLEL_SIGMA, radius_fixed=fixed)
-            fit = refine(begin, self.views, known, self.radii)
-            if fit is None or self._accepts(fit, known, PARALLEL_CONVINCING):
-                return fit
-        return None
+        starts = [
+            Start(start, start.radius, True, depth_sigma, PARALLEL_SIGMA, radius_fixed=fixed) for fixed in (False, True)
+        ]
+        fits = [refine(each, self.views, known, self.radii) for each in starts]
+        seen = [fit for fit in fits if fit is not None]
+        good = (fit for least in PARALLEL_CONVINCING for fit in seen if self._accepts(fit, known, least))
+        return next(good, None)
 
     def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
         """The whole of a pipe of the given radius [m] of which a piece was found.
@@ -158,12 +162,15 @@ class _LineFitter:
         fit = refine(start, self.views, known, self.radii, follow)
         return fit if fit is not None and self._accepts(fit, known, LINES_CONVINCING) else None
 
-    def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], convincing: float) -> bool:
-        """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does."""
+    def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], least: tuple[float, float]) -> bool:
+        """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does.
+
+        `least`: support required of the contour, and of each of its sides.
+        """
         return (
-            fit.support >= convincing
+            fit.support >= least[0]
             and is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
-            and Scene.of(fit.cylinder, self.views, known).support().weaker_share >= 0.5 * convincing
+            and Scene.of(fit.cylinder, self.views, known).support().weaker_share >= least[1]
             and fit.flatness - FLAT <= SURELY * fit.flatness_sigma
         )
 
