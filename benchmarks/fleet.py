@@ -30,6 +30,7 @@ from typing import Any
 import psutil
 from mcap.reader import make_reader
 
+from benchmarks.markdown import measured_rows
 from benchmarks.recordings import DEMO, ROOT
 from benchmarks.survey import COMMAND, RESULTS, commit
 from pipeprog_bringup.fleet.recordings import Inputs, listed
@@ -43,6 +44,12 @@ from tests.unit.bringup.fleet.stand_ins import write_results
 HOME = ROOT / "out" / "fleet"
 STAND_IN_SECONDS = 2.0
 # Files of a survey that hold times and paths beside its results.
+TITLES = {
+    "simulated": "Recordings whose surveys take a second and fail by a plan",
+    "throughput": "One after another, and as a fleet of one and of two workers",
+    "kills": "Workers and schedulers killed during replays",
+    "kills_stand_in": "Workers and schedulers killed during surveys of two seconds",
+}
 NOT_COMPARED = {"run.json", "config.yaml", "out.mcap", "report.html"}
 
 
@@ -361,9 +368,15 @@ def main() -> None:
         arguments["is_stand_in"] = arguments.pop("stand_in")
         name += "_stand_in" * arguments["is_stand_in"]
     measures: dict[str, Callable[..., dict[str, Any]]] = {"simulated": simulated, "throughput": throughput}
-    figures = {"commit": commit(), **measures.get(name, kills)(**arguments)}
-    (RESULTS / f"fleet_{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
-    print(json.dumps(figures, indent=1))
+    given = " ".join(f"--{key} {value}" for key, value in arguments.items() if key != "is_stand_in")
+    content = {
+        "title": TITLES[name],
+        "command": f"python -m benchmarks.fleet {name.replace('_stand_in', ' --stand-in')} {given}",
+        "commit": commit(),
+        "rows": measured_rows(measures.get(name, kills)(**arguments)),
+    }
+    (RESULTS / f"fleet_{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+    print(json.dumps(content, indent=1))
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
+from benchmarks.markdown import measured_rows
 from benchmarks.recordings import ROOT, Recording, made, named
 from benchmarks.survey import RESULTS, commit, measure
 from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph
@@ -210,10 +211,8 @@ def main() -> None:
         "title": f"Live and replay of {name}: latencies, CPU time and memory",
         "command": f"python -m benchmarks.live_latency {shown}",
         "commit": commit(),
-        "cpus": os.cpu_count(),
-        "load before": round(os.getloadavg()[0], 2),
-        "live": live(recording, folder),
-        "replay": replayed(recording, folder / "replay"),
+        "findings": {"processors": os.cpu_count(), "load before": round(os.getloadavg()[0], 2)},
+        "rows": measured_rows({"live": live(recording, folder), "replay": replayed(recording, folder / "replay")}),
     }
     (RESULTS / f"live_latency_{name}.json").write_text(json.dumps(content, indent=1) + "\n")
     print(json.dumps(content, indent=1))

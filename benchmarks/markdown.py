@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 
@@ -12,6 +12,18 @@ def rows_table(rows: Sequence[dict[str, Any]], without: Sequence[str] = ()) -> s
     """A table of a result's rows, a column for each key but those `without`."""
     keys = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in without]
     return table(map(heading, keys), [[cell(row.get(key)) for key in keys] for row in rows])
+
+
+def measured_rows(figures: Mapping[str, Any], of: str = "") -> list[dict[str, Any]]:
+    """Rows of what was measured and its value, of figures that lie within each other."""
+    rows = []
+    for name, value in figures.items():
+        what = f"{of}: {name}" if of else name
+        if isinstance(value, Mapping):
+            rows += measured_rows(value, what)
+        else:
+            rows.append({"what": heading(what), "measured": "none" if value == [] else value})
+    return rows
 
 
 def table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:

@@ -56,6 +56,11 @@ PAPERS_METHOD = (
 )
 
 PAGES = {
+    "fleet": Page(
+        "A fleet's recordings on Dask",
+        ("fleet_throughput", "fleet_kills", "fleet_kills_stand_in", "fleet_simulated"),
+        "What `pipeprog fleet` does and what it costs: [fleet](../fleet.md).",
+    ),
     "board_views": Page(
         "Experiment 1: the scale from few views of the board",
         ("board_views",),
