@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
+from pipeprog_bringup.results.folder_lock import locked
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.json_file import read_json
 
@@ -45,7 +46,7 @@ class OutputFolder:
             if not self._force and any(self.path.iterdir()):
                 raise InputError(f"{self.path} is not empty: choose another --out, or replace its results with --force")
             self._stage = Path(tempfile.mkdtemp(prefix=_STAGE_PREFIX, dir=self.path))
-            self._lock = _locked(self._stage)
+            self._lock = locked(self._stage)
             self._stage.joinpath(".probe").write_bytes(bytes(4096))
             self._stage.joinpath(".probe").unlink()
         except OSError as error:
@@ -92,7 +93,7 @@ class OutputFolder:
             return  # without locks the two are not told apart
         for stage in self.path.glob(f"{_STAGE_PREFIX}*"):
             try:
-                os.close(_locked(stage))
+                os.close(locked(stage))
             except BlockingIOError:
                 raise InputError(
                     f"another run is writing to {self.path}: wait for it, or choose another --out"
@@ -140,26 +141,6 @@ class OutputFolder:
             for folder in reversed(self._made):
                 with contextlib.suppress(OSError):
                     folder.rmdir()
-
-
-if sys.platform == "win32":
-
-    def _locked(folder: Path) -> int:
-        """-1: Windows locks no folders."""
-        return -1
-
-else:
-    import fcntl
-
-    def _locked(folder: Path) -> int:
-        """Descriptor that holds a folder locked until it is closed; BlockingIOError where another run holds it."""
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(descriptor)
-            raise
-        return descriptor
 
 
 @contextlib.contextmanager

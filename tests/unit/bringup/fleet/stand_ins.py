@@ -40,7 +40,7 @@ def write_results(folder: Path, metres: float) -> None:
 def survey_by_plan(task: Task, folder: Path, watcher: Watcher) -> dict[str, Any]:
     """Does what the recording says.
 
-    A number: so many metres are found. `refuse`, `fail`: always. `fail once`, `kill once`, `kill`: as recorded beside
+    A number: the metres that are found. `refuse`, `fail`: always. `fail once`, `kill once`, `kill`: as recorded beside
     --out, in a file that takes a line a try; `kill` is of the worker. `wait`: until nobody waits any more.
     """
     (recording,) = (folder / "recording").iterdir()
