@@ -10,7 +10,6 @@ come. Writes results/live_latency_NAME.json; to be run on an idle machine, after
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -26,8 +25,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
 from benchmarks.markdown import measured_rows
-from benchmarks.recordings import ROOT, Recording, made, named
-from benchmarks.survey import RESULTS, commit, measure
+from benchmarks.recordings import ROOT, Recording, one_recording
+from benchmarks.survey import RESULTS, commit, measure, score_figures
 from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph
 from pipeprog_bringup.playback.player import IMAGE_TYPES, calibration
 from pipeprog_bringup.playback.private_network import private_network
@@ -189,27 +188,18 @@ def replayed(recording: Recording, folder: Path) -> dict[str, Any]:
     return {
         "recording_s": round(length, 1),
         "replay / recording": round(figures["wall_s"] / length, 2),
-        **{key: figures[key] for key in ("wall_s", "cpu_s", "largest_process_mib", "timings_s", "keyframes", "score")},
+        **{key: figures[key] for key in ("wall_s", "cpu_s", "largest_process_mib", "timings_s", "keyframes")},
+        "score": score_figures(figures["score"]),
     }
 
 
 def main() -> None:
     """Measure one recording."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.live_latency",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("recording", nargs="?", default="demo")
-    parser.add_argument("--name", default="", help="of the result; the recording's name where it is left out")
-    arguments = parser.parse_args()
-    recording = made(named(arguments.recording))
-    name = arguments.name or recording.name
+    recording, name, command = one_recording("live_latency", __doc__)
     folder = ROOT / "out" / "live" / name
-    shown = arguments.recording if recording.made_by else recording.bag.name
     content = {
         "title": f"Live and replay of {name}: latencies, CPU time and memory",
-        "command": f"python -m benchmarks.live_latency {shown}",
+        "command": command,
         "commit": commit(),
         "findings": {"processors": os.cpu_count(), "load before": round(os.getloadavg()[0], 2)},
         "rows": measured_rows({"live": live(recording, folder), "replay": replayed(recording, folder / "replay")}),

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,3 +58,24 @@ def made(recording: Recording) -> Recording:
         arguments = recording.made_by.split()
         subprocess.run([sys.executable, *arguments], cwd=ROOT, check=True)
     return recording
+
+
+def one_recording(
+    module: str, description: str | None, arguments: Sequence[str] | None = None
+) -> tuple[Recording, str, str]:
+    """The recording that a command line names (made if it is not there), its result's name, and the command to repeat.
+
+    Args:
+        module: name of the benchmark's module, such as `stage_cost`.
+        description: its docstring.
+        arguments: of the command line; the process's own where None.
+    """
+    command = f"python -m benchmarks.{module}"
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog=command, description=description, formatter_class=formatter)
+    parser.add_argument("recording", nargs="?", default="demo")
+    parser.add_argument("--name", default="", help="of the result; the recording's name where it is left out")
+    given = parser.parse_args(arguments)
+    recording = made(named(given.recording))
+    shown = given.recording if recording.made_by else recording.bag.name
+    return recording, given.name or recording.name, f"{command} {shown}"

@@ -27,7 +27,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CompressedImage
 
 from benchmarks.recordings import ROOT, Recording, made, site
-from benchmarks.survey import RESULTS, attempt
+from benchmarks.survey import RESULTS, attempt, score_figures
 from pipeprog_bringup.recording.bag import Bag
 
 sys.path.insert(0, str(ROOT / "bags"))
@@ -134,21 +134,7 @@ def _figures(shot: Shot) -> dict[str, Any]:
     known = attempt(recording, (), f"robustness_{recording.name}")
     if "failed" in known:
         return {"F": 0.0, "why": known["failed"]}
-    score = known["score"]
-    found, pipes = score["classification"], score["pipes"]
-    return {
-        "F": round(found["f_measure"] or 0.0, 3),
-        "right class": f"{found['true_positives']} of {len(pipes) + len(score['missed'])}",
-        "false": found["false_positives"],
-        "radius RMSE [mm]": _rounded(score["radius"]["rmse_mm"]),
-        "length error [%]": _rounded(score["length"]["mean_error_percent"]),
-        "scale error [%]": _rounded(score["scale"]["error_percent"]),
-        "commit": known["commit"],
-    }
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 3)
+    return {**score_figures(known["score"]), "commit": known["commit"]}
 
 
 def _draw(rows: list[dict[str, Any]], picture: Path = PICTURE) -> None:

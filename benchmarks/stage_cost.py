@@ -10,7 +10,6 @@ results/stage_cost_NAME.json.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import functools
 import json
@@ -28,7 +27,7 @@ import cv2
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CompressedImage
 
-from benchmarks.recordings import Recording, made, named
+from benchmarks.recordings import Recording, one_recording
 from benchmarks.survey import RESULTS, RUNS, attempt, commit
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_detect.config import DetectConfig
@@ -146,26 +145,16 @@ def _chosen(frames: Path) -> set[int]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure one recording."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.stage_cost",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("recording", nargs="?", default="demo")
-    parser.add_argument("--name", default="", help="of the result; the recording's name where it is left out")
-    given = parser.parse_args(arguments)
-    recording = made(named(given.recording))
-    name = given.name or recording.name
+    recording, name, command = one_recording("stage_cost", __doc__, arguments)
     attempt(recording, name=name)
     cv2.setNumThreads(1)
     stages = Stages()
     stamps = _chosen(RUNS / name / "frames.csv")
     found, keyframes = reconstruct(recording, stamps, stages)
-    shown = given.recording if recording.made_by else recording.bag.name
     table = rows("sfm", stages.seconds) + rows("detect", detected(recording, found, keyframes))
     content = {
         "title": f"CPU time by stage on {name}, one thread",
-        "command": f"python -m benchmarks.stage_cost {shown}",
+        "command": command,
         "commit": commit(),
         "load": round(os.getloadavg()[0], 2),
         "keyframes": len(stamps),

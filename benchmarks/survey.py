@@ -115,6 +115,23 @@ def commit() -> str:
     return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
 
+def score_figures(score: dict[str, Any]) -> dict[str, Any]:
+    """The figures of a score that go into a row of a result, plain numbers."""
+    found, pipes = score["classification"], score["pipes"]
+    return {
+        "F": round(found["f_measure"] or 0.0, 3),
+        "right class": f"{found['true_positives']} of {len(pipes) + len(score['missed'])}",
+        "false": found["false_positives"],
+        "radius RMSE [mm]": _rounded(score["radius"]["rmse_mm"]),
+        "length error [%]": _rounded(score["length"]["mean_error_percent"]),
+        "scale error [%]": _rounded(score["scale"]["error_percent"]),
+    }
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
 def line(name: str, figures: dict[str, Any]) -> str:
     """One line of a table: what was found, the errors, the time."""
     score = figures["score"]
