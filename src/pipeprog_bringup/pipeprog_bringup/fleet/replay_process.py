@@ -16,6 +16,7 @@ from typing import Any
 
 import psutil
 
+from pipeprog_bringup.fleet.cores import own_cores
 from pipeprog_bringup.fleet.task import Refused, SurveyFailure, Task, Unwanted, Watcher
 from pipeprog_camera.outside_text import for_terminal
 
@@ -24,13 +25,7 @@ _TELL_SECONDS = 1.0  # between two messages to who waits
 _WEIGH_SECONDS = 2.0  # between two looks at its memory, which take 10 ms
 _STOP_SECONDS = 8.0  # in which a replay ends its nodes, 3 s each way
 _USAGE = 2  # exit status of the command: wrong options
-# The command as a child that the kernel ends with its parent; set by the child itself, since a fork of a process with
-# threads must do nothing before exec. Arguments: parent's number, arguments of the command.
-_START = (
-    "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); "
-    "os.getppid() == int(sys.argv.pop(1)) or os._exit(1); sys.argv[0] = 'pipeprog'; "
-    "from pipeprog_bringup.cli import main; main()"
-)
+_CHILD, _COMMAND = "pipeprog_bringup.fleet.child", "pipeprog_bringup.cli"
 
 
 def replay_and_report(task: Task, folder: Path, watcher: Watcher) -> dict[str, Any]:
@@ -45,11 +40,12 @@ def replay_and_report(task: Task, folder: Path, watcher: Watcher) -> dict[str, A
     options += [part for key, topic in inputs.topics.items() for part in (f"--{key.replace('_', '-')}", topic)]
     started = time.monotonic()
     arguments = ["replay", str(recording), "--boq", f"boq{task.boq_kind}", *board, "--out", "results", *options]
-    with _Command(arguments, task, folder) as replay:
-        replay.follow(watcher)
-    replayed = time.monotonic()
-    with _Command(["report", "results", "--out", "results/report.html"], task, folder) as report:
-        report.follow(watcher)
+    with own_cores(task.cores) as cores:
+        with _Command(arguments, task, folder, cores) as replay:
+            replay.follow(watcher)
+        replayed = time.monotonic()
+        with _Command(["report", "results", "--out", "results/report.html"], task, folder, cores) as report:
+            report.follow(watcher)
     return {
         "replay_s": round(replayed - started, 3),
         "report_s": round(time.monotonic() - replayed, 3),
@@ -58,9 +54,9 @@ def replay_and_report(task: Task, folder: Path, watcher: Watcher) -> dict[str, A
 
 
 class _Command:
-    """Context in which a command of pipeprog runs in `folder`; at its end the process and its children are ended."""
+    """Context in which a command of pipeprog runs in `folder`, on `cores` alone; at its end all its processes end."""
 
-    def __init__(self, arguments: list[str], task: Task, folder: Path) -> None:
+    def __init__(self, arguments: list[str], task: Task, folder: Path, cores: frozenset[int]) -> None:
         self._name, self._folder, self._log = arguments[0], folder, folder / "replay.log"
         self._state = folder / "state.json"
         self._state.unlink(missing_ok=True)
@@ -69,14 +65,15 @@ class _Command:
         temporary = folder / "tmp"
         temporary.mkdir(exist_ok=True)
         self._environment = {**os.environ, **_threads(task.cores), "TMPDIR": str(temporary), "PYTHONUNBUFFERED": "1"}
-        self._arguments = arguments
+        self._arguments, self._cores = arguments, ",".join(map(str, sorted(cores)))
         self._recording, self._uri = arguments[1], task.recording.uri
         self.peak_mb = 0
 
     def __enter__(self) -> _Command:
+        python = [sys.executable, "-m"]
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _START, str(os.getpid()), *self._arguments],
+                [*python, _CHILD, str(os.getpid()), self._cores, *python, _COMMAND, *self._arguments],
                 cwd=self._folder,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,

@@ -30,6 +30,9 @@ _POLL_SECONDS = 0.5  # between two looks at how many workers there are
 _CONNECT_SECONDS = 30.0  # for the first answer of a scheduler
 _PATIENCE_SECONDS = 1800.0  # for one that was there to come back: a machine that starts again takes minutes
 _BARE_SECONDS = 60.0  # without a worker on this machine, whose start takes 5 s: Dask has given up starting it
+# Deaths of workers that ran a recording and no other before it is given up. Workers that are killed every other time,
+# whatever they run, take a healthy one with them ten times in a row once in 1000.
+_DEATHS_ALONE = 10
 _SPARE = 0.9  # of a machine's memory; the rest is for its system and the worker itself
 
 Tell = Callable[[dict[str, Any]], None]
@@ -106,8 +109,9 @@ def run(tasks: Sequence[Task], connect: Connect, runner: Runner, tell: Tell) -> 
     """The outcome of each task, as they come; `tell` gets the states of the surveys that run.
 
     A task whose worker died runs again; where that has happened as often as Dask allows (`allowed-failures`, 3), it
-    runs at the end with no other beside it, so that one that kills its workers takes no other with it. One that failed
-    otherwise is tried twice. A cluster whose scheduler is lost is connected to again, and what is left given to it.
+    runs at the end with no other beside it. Only the deaths of workers that ran it alone are held against it, and of
+    _DEATHS_ALONE it is given up. One that failed otherwise is tried twice. A cluster whose scheduler is lost is
+    connected to again, and what is left given to it.
     Raises InputError where the cluster cannot be used.
     """
     left = {task.name: task for task in tasks}
@@ -128,8 +132,8 @@ class _Session:
         self._waiting = deque(tasks)
         self._running: dict[Future, Task] = {}
         self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        self._suspects: deque[Task] = deque()  # their workers have died too often; one of them may be the reason
-        self._alone: set[str] = set()  # of them those that have run with no other beside them
+        self._suspects: deque[Task] = deque()  # their workers have died too often; each is to run alone
+        self._deaths: dict[str, int] = {}  # of workers that ran one of them alone
         self._logs: dict[str, str] = {}
         self._staffed = time.monotonic()  # when there was a worker
 
@@ -184,7 +188,7 @@ class _Session:
         room = max((offer[MEMORY] for offer in offers if MEMORY in offer), default=None)
         if self._suspects and not self._waiting and not self._running:
             self._waiting.append(self._suspects.popleft())
-            self._alone.add(self._waiting[0].name)
+            self._deaths.setdefault(self._waiting[0].name, 0)
         while self._waiting and len(self._running) < max(1, sum(slots)):
             task = self._waiting.popleft()
             needed: dict[str, float] = {SLOT: 1}
@@ -207,10 +211,12 @@ class _Session:
             reason, log = getattr(error, "reason", f"{type(error).__name__}: {error}"), getattr(error, "log", "")
             return Outcome(task.name, "failed", reason, log)
         log = self._logs.get(task.name, "")
-        if task.name not in self._alone:
+        if task.name in self._deaths:
+            self._deaths[task.name] += error.allowed_failures + 1
+        if self._deaths.get(task.name, 0) < _DEATHS_ALONE:
             self._suspects.append(task)
             return None
-        reason = "its worker died whenever it ran, at last with no other survey beside it"
+        reason = f"its worker died {self._deaths[task.name]} times while no other survey ran: does it need more memory?"
         return Outcome(task.name, "failed", reason, log)
 
     def _hear(self, state: dict[str, Any]) -> None:

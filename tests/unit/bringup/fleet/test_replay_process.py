@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -22,10 +23,11 @@ from pipeprog_bringup.fleet.task import Refused, Task, Unwanted
 from tests.unit.bringup.fleet.stand_ins import BOQ
 
 ENDLESS = """
-import sys, time
+import contextlib, os, sys
 from pathlib import Path
 from pipeprog_bringup.fleet import replay_process
-replay_process._START = "import ctypes, signal, sys, time; ctypes.CDLL(None).prctl(1, signal.SIGKILL); time.sleep(99)"
+replay_process.own_cores = lambda count: contextlib.nullcontext(frozenset([max(os.sched_getaffinity(0))]))
+replay_process._COMMAND = "tests.unit.bringup.fleet.endless"
 from tests.unit.bringup.fleet.test_replay_process import task_of, Watching
 replay_process.replay_and_report(task_of(Path(sys.argv[1])), Path(sys.argv[1]), Watching())
 """
@@ -64,24 +66,14 @@ def test_where_nobody_waits_the_command_is_ended(tmp_path: Path) -> None:
     assert not [child for child in psutil.Process().children() if "replay" in child.cmdline()]
 
 
-def test_the_command_ends_with_a_worker_that_is_killed(tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+def test_the_command_has_the_cores_of_its_survey_and_ends_with_a_worker_that_is_killed(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, os.getcwd()])}
     with subprocess.Popen([sys.executable, "-c", ENDLESS, str(tmp_path)], env=environment) as worker:
-        process = psutil.Process(worker.pid)
-        while not (commands := process.children()):
+        while not (started := tmp_path / "started.json").exists():
             assert worker.poll() is None
             time.sleep(0.02)
-        wait_until_running(commands[0])
+        commands = psutil.Process(worker.pid).children()
+        assert json.loads(started.read_text()) == {"cores": [max(os.sched_getaffinity(0))], "score": "1000"}
         os.kill(worker.pid, signal.SIGKILL)
     psutil.wait_procs(commands, timeout=10)
     assert not commands[0].is_running()
-
-
-def wait_until_running(process: psutil.Process) -> None:
-    """Until the kernel has been asked to end it with its parent: the program itself runs, and sleeps."""
-    deadline = time.monotonic() + 20
-    while time.monotonic() < deadline:
-        if process.status() == psutil.STATUS_SLEEPING and "time.sleep" in " ".join(process.cmdline()):
-            return
-        time.sleep(0.02)
-    raise AssertionError("the command did not start")

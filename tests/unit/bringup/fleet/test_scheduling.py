@@ -108,18 +108,75 @@ def test_an_interruption_ends_what_runs(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "r001").exists()
 
 
-def test_a_killed_worker_costs_time_and_a_task_that_kills_them_itself_alone(tmp_path: Path) -> None:
+def test_a_killed_worker_costs_time_and_a_task_that_kills_them_itself_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plans = ["kill once", "kill", "2", "3"]
-
+    monkeypatch.setattr("pipeprog_bringup.fleet.scheduling._DEATHS_ALONE", 2)
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
         found = {one.name: one for one in outcomes_of(tasks_of(tmp_path, plans), lambda: local_cluster(2, 1))}
     assert {name: one.state for name, one in found.items()} == {
         **dict.fromkeys(("r000", "r002", "r003"), "done"),
         "r001": "failed",
     }
-    assert "its worker died" in found["r001"].reason
+    assert "its worker died 2 times while no other survey ran" in found["r001"].reason
     assert found["r001"].log == "it works\n"
     killed = {int(pid) for pid in (tmp_path / "out.tries" / "r001").read_text().split()}
     for pid in killed:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, signal.SIG_DFL)
+
+
+class Ended:
+    """A future that has ended."""
+
+    def __init__(self, name: str, is_dead: bool) -> None:
+        self._name, self.status = name, "error" if is_dead else "finished"
+
+    def add_done_callback(self, call: Any) -> None:
+        call(self)
+
+    def exception(self) -> Exception:
+        return distributed.KilledWorker(self._name, None, 0)
+
+    def result(self) -> Outcome:
+        return Outcome(self._name, "done")
+
+    def release(self) -> None:
+        pass
+
+
+class Cluster:
+    """A cluster as a session sees it, whose futures end at once with the death of the worker.
+
+    `deaths` says how often for each recording; after that its survey is done.
+    """
+
+    cluster, status = None, "running"
+
+    def __init__(self, deaths: dict[str, int]) -> None:
+        self._deaths = deaths
+        self.ran: list[str] = []
+
+    def subscribe_topic(self, *_: Any) -> None:
+        pass
+
+    def cancel(self, _: Any) -> None:
+        pass
+
+    def scheduler_info(self) -> dict[str, Any]:
+        return {"workers": {"tcp://one": {"resources": {SLOT: 1}}}}
+
+    def submit(self, _: Any, task: Task, *__: Any, **___: Any) -> Ended:
+        self.ran.append(task.name)
+        self._deaths[task.name] -= 1
+        return Ended(task.name, self._deaths[task.name] >= 0)
+
+
+def test_only_deaths_of_a_worker_that_ran_it_alone_are_held_against_a_recording(tmp_path: Path) -> None:
+    tasks = tasks_of(tmp_path, ["1"] * 3)
+    client: Any = Cluster({"r000": 10, "r001": 11, "r002": 0})
+    outcomes = list(run(tasks, lambda: contextlib.nullcontext(client), survey_by_plan, lambda _: None))
+    assert {one.name: one.state for one in outcomes} == {"r000": "done", "r001": "failed", "r002": "done"}
+    assert client.ran[:3] == ["r000", "r001", "r002"]
+    assert client.ran[3:7] == ["r000", "r001"] * 2, "suspects take turns"
