@@ -19,6 +19,8 @@ MAX_PIXEL_ASPECT = 4.0  # fx / fy or its inverse; 2 for the fields of interlaced
 MAX_OFF_CENTRE = 1.0  # image sizes from the border to a principal point outside: a corner cut out of a larger image
 MAX_CORNER_SHIFT = 1.0  # diagonals by which distortion moves a corner; the strongest barrel lenses stay below 0.5
 MAX_DISTORTION_COEFFICIENTS = 14  # of rational_polynomial, the longest model
+MAX_READOUT = 0.1  # s from the first row to the last; phones take 0.004 to 0.035, the slowest drones 0.074
+MAX_VELOCITY = 1000.0  # m/s and rad/s of a camera; a drone flies at 20 and turns at 5
 
 # Clouds and trajectories.
 MAX_CLOUD_POINTS = 1 << 26  # points; 67 million: a building at 5 mm; 1.6 GB as coordinates in double precision

@@ -8,7 +8,7 @@ from array import array
 import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -26,6 +26,7 @@ from pipeprog_camera.limits import (
     MAX_SECONDS,
 )
 from pipeprog_camera.raw_image import SAMPLES, check_layout
+from pipeprog_msgs.msg import KeyframeVelocities
 
 SECOND = 1_000_000_000  # ns
 
@@ -126,6 +127,17 @@ def path(path_header: Header, stamps: NDArray[np.int64], map_from_camera: NDArra
         message = Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
         poses.append(PoseStamped(header=header(stamp, path_header.frame_id), pose=message))
     return Path(header=path_header, poses=poses)
+
+
+def keyframe_velocities(
+    path_header: Header, readout: float, linear: NDArray[np.float64], angular: NDArray[np.float64]
+) -> KeyframeVelocities:
+    """Velocities (N, 3) [m/s] and (N, 3) [rad/s] for the path of equal header; readout in s."""
+    velocities = []
+    for shift, turn in zip(linear.tolist(), angular.tolist(), strict=True):
+        (x, y, z), (rx, ry, rz) = shift, turn
+        velocities.append(Twist(linear=Vector3(x=x, y=y, z=z), angular=Vector3(x=rx, y=ry, z=rz)))
+    return KeyframeVelocities(header=path_header, readout=readout, velocities=velocities)
 
 
 def poses_from_path(message: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -29,8 +29,10 @@ from pipeprog_camera.limits import (
     MAX_QUATERNION_ERROR,
     MAX_SECONDS,
     MAX_TRANSFORMS,
+    MAX_VELOCITY,
 )
-from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray, KeyframesRetired, SfmStatus
+from pipeprog_camera.rolling_shutter import check_readout
+from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray, KeyframesRetired, KeyframeVelocities, SfmStatus
 from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
 
@@ -120,13 +122,24 @@ class ReceivedPoses:
 
 
 @dataclass(frozen=True)
+class ReceivedVelocities:
+    """Velocities of keyframes: stamp [ns] of the publication, read-out [s], (N, 3) [m/s], (N, 3) [rad/s]."""
+
+    stamp: int
+    readout: float
+    linear: NDArray[np.float64]
+    angular: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class ReceivedStatus:
-    """Health of the reconstruction: stamp [ns] and number of its last map (0: none yet), scale as in SfmStatus."""
+    """Health of the reconstruction: stamp [ns] and number of its last map (0: none yet), the rest as in SfmStatus."""
 
     stamp: int
     revision: int
     scale_source: str
     scale_sigma: float
+    readout: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -370,6 +383,32 @@ def keyframe_poses(message: Path) -> ReceivedPoses:
     return ReceivedPoses(stamp, stamps, map_from_camera)
 
 
+def keyframe_velocities(message: KeyframeVelocities) -> ReceivedVelocities:
+    """Finite velocities within MAX_VELOCITY, and a read-out that a rolling shutter can have."""
+    stamp, _ = stamp_and_frame(message.header)
+    _check_readout(message.readout)
+    if message.readout == 0.0:
+        raise InvalidMessageError("read-out", "velocities with a read-out of 0 s: a global shutter needs none")
+    if len(message.velocities) > MAX_POSES:
+        raise InvalidMessageError("velocities", f"{len(message.velocities)} velocities: {MAX_POSES} at most are taken")
+    parts = [[(v.x, v.y, v.z) for v in (twist.linear, twist.angular)] for twist in message.velocities]
+    linear, angular = np.array(parts, float).reshape(-1, 2, 3).swapaxes(0, 1)
+    for name, values in (("linear", linear), ("angular", angular)):
+        wrong = np.flatnonzero(~(np.abs(values) <= MAX_VELOCITY).all(axis=1))  # NaN, too
+        if len(wrong):
+            raise InvalidMessageError(
+                "velocities", f"the {name} velocity of keyframe {wrong[0]} is {values[wrong[0]]}: no camera moves so"
+            )
+    return ReceivedVelocities(stamp, message.readout, linear, angular)
+
+
+def _check_readout(readout: float) -> None:
+    try:
+        check_readout(readout)
+    except InputError as error:
+        raise InvalidMessageError("read-out", str(error)) from None
+
+
 def sfm_status(message: SfmStatus) -> ReceivedStatus:
     """Number and scale of the last map; a map has a scale with a standard deviation."""
     stamp_and_frame(message.header)
@@ -382,4 +421,5 @@ def sfm_status(message: SfmStatus) -> ReceivedStatus:
         )
     if message.map_revision and not 0.0 <= message.scale_sigma < np.inf:
         raise InvalidMessageError("scale", f"scale_sigma is {message.scale_sigma:g}: a map has one, zero or larger")
-    return ReceivedStatus(stamp, message.map_revision, message.scale_source, message.scale_sigma)
+    _check_readout(message.readout)
+    return ReceivedStatus(stamp, message.map_revision, message.scale_source, message.scale_sigma, message.readout)

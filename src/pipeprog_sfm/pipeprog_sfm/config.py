@@ -5,7 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from pipeprog_camera.limits import MAX_READOUT
+from pipeprog_camera.rolling_shutter import check_readout
 from pipeprog_camera.setting_field import setting
+
+NOT_TOLD = -1.0  # s, a read-out that is not known
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,13 @@ class SfmConfig:
     """All settings of the reconstruction."""
 
     seed: int = setting(0, "seed of every random number generator", "", (0, 2**31 - 1))
+    readout: float = setting(
+        NOT_TOLD,
+        "rolling shutter: time from the first row of an image to the last; 0: all rows at once; -1: not told, "
+        "taken as 0",
+        "s",
+        (NOT_TOLD, MAX_READOUT),
+    )
     map_interval: int = setting(5, "number of keyframes between two publications of the map", "", (1, 1000))
     mapper: MapperConfig = field(default_factory=MapperConfig)
     deblur: DeblurConfig = field(default_factory=DeblurConfig)
@@ -84,3 +95,7 @@ class SfmConfig:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+
+    def __post_init__(self) -> None:
+        if self.readout != NOT_TOLD:
+            check_readout(self.readout)

@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2, PointField
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.limits import MAX_CLOUD_FIELDS, MAX_CLOUD_POINTS, MAX_COORDINATE, MAX_POSES
-from pipeprog_msgs.msg import SfmStatus
+from pipeprog_msgs.msg import KeyframeVelocities, SfmStatus
 from pipeprog_node import messages, received
 from pipeprog_node.intake import InvalidMessageError
 
@@ -65,6 +65,12 @@ def png_of(width: int, height: int) -> bytes:
     return file.getvalue()[:16] + width.to_bytes(4, "big") + height.to_bytes(4, "big") + file.getvalue()[24:]
 
 
+def velocities(speed: float = 1.0, readout: float = 0.015) -> KeyframeVelocities:
+    """Of two keyframes."""
+    linear = np.array([[0.1, 0.2, 0.3], [0.1, speed, 0.3]])
+    return messages.keyframe_velocities(messages.header(STAMP, "map"), readout, linear, 0.1 * linear)
+
+
 ROWS: list[tuple[str, Callable[[Any], object], Any]] = [
     ("calibration: K of zeros", received.camera_info, changed(info(), "k", np.zeros(9))),
     ("calibration: K of NaN", received.camera_info, changed(info(), "k", np.full(9, np.nan))),
@@ -91,6 +97,12 @@ ROWS: list[tuple[str, Callable[[Any], object], Any]] = [
     ("poses: quaternion of zeros", received.keyframe_poses, changed(poses(), "poses.1.pose.orientation.w", 0.0)),
     ("poses: quaternion of NaN", received.keyframe_poses, changed(poses(), "poses.1.pose.orientation.w", np.nan)),
     ("poses: position of NaN", received.keyframe_poses, changed(poses(), "poses.1.pose.position.y", np.nan)),
+    ("velocities: of NaN", received.keyframe_velocities, velocities(speed=np.nan)),
+    ("velocities: faster than any camera", received.keyframe_velocities, velocities(speed=1e9)),
+    ("read-out: of a second", received.keyframe_velocities, velocities(readout=1.0)),
+    ("read-out: below zero", received.keyframe_velocities, velocities(readout=-0.01)),
+    ("read-out: of no rolling shutter", received.keyframe_velocities, velocities(readout=0.0)),
+    ("read-out: of NaN", received.sfm_status, SfmStatus(readout=np.nan)),
     ("image: empty", received.compressed_image, picture(b"")),
     ("image: not to be decoded", received.compressed_image, picture(b"no image")),
     ("image: over 2^30 pixels", received.compressed_image, picture(png_of(40_000, 40_000))),
@@ -118,6 +130,16 @@ def test_a_good_map_is_taken_as_it_is() -> None:
     assert len(received.keyframe_poses(poses(0)).stamps) == 0
     status = SfmStatus(map_revision=3, map_stamp=messages.time_msg(STAMP), scale_source="board", scale_sigma=0.001)
     assert received.sfm_status(status) == received.ReceivedStatus(17, 3, "board", 0.001)
+
+
+def test_velocities_come_as_they_were_sent() -> None:
+    header = messages.header(17, "map")
+    linear = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
+    angular = np.negative(linear)
+    taken = received.keyframe_velocities(messages.keyframe_velocities(header, 0.015, linear, angular))
+    assert (taken.stamp, taken.readout) == (17, 0.015)
+    np.testing.assert_array_equal(taken.linear, linear)
+    np.testing.assert_array_equal(taken.angular, angular)
 
 
 def test_single_points_that_are_nowhere_are_left_out() -> None:

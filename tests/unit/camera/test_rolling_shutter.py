@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rolled and unrolled pixels: each undoes the other, and both agree with the generator's rolling sensor."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
+from pipeprog_camera.rolling_shutter import RowMotion
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "bags"))
+
+CAMERA = Camera(1280, 720, 914.0, 914.0, 639.5, 359.5)
+LENS = replace(CAMERA, distortion=(-0.2, 0.05, 0.001, -0.0005, 0.0))
+coordinate = st.floats(-1.5, 1.5)
+velocity = st.tuples(coordinate, coordinate, coordinate).map(np.array)
+
+
+def seen(seed: int, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) points in front of a camera, and (N, 2) their ideal pixels."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform([20, 20], [camera.width - 20, camera.height - 20], (50, 2))
+    depths = rng.uniform(0.8, 5.0, 50)
+    rays = np.c_[(pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(50)]
+    return depths[:, None] * rays, pixels
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "distorted"])
+@settings(max_examples=30, deadline=None)
+@given(linear=velocity, angular=velocity, readout=st.floats(0.0, 0.035), seed=st.integers(0, 100))
+def test_unrolled_undoes_rolled(
+    camera: Camera, linear: np.ndarray, angular: np.ndarray, readout: float, seed: int
+) -> None:
+    points, pixels = seen(seed, camera)
+    motion = RowMotion(readout, camera.height, linear, angular)
+    rolled = motion.rolled_pixels(pixels, points, camera)
+    np.testing.assert_allclose(motion.unrolled_pixels(rolled, points[:, 2], camera), pixels, atol=0.01)
+
+
+def test_no_readout_gives_the_input() -> None:
+    points, pixels = seen(1, LENS)
+    motion = RowMotion(0.0, 720, np.ones(3), np.ones(3))
+    assert (motion.rolled_pixels(pixels, points, LENS) == pixels).all()
+    assert (motion.unrolled_pixels(pixels, points[:, 2], LENS) == pixels).all()
+
+
+def test_a_pixel_moves_by_what_the_camera_moves_until_its_row() -> None:
+    """At 1 m/s to the right, 2 m away, the last row of 20 ms (10 ms after the stamp) is 10 mm late: 4.57 px."""
+    motion = RowMotion(0.02, 720, np.array([-1.0, 0.0, 0.0]), np.zeros(3))
+    rolled = motion.rolled_pixels([[639.5, 719.5]], [[0.0, 2.0 * 360 / 914, 2.0]], CAMERA)
+    assert rolled[0] == pytest.approx([639.5 - 914 * 0.01 / 2, 719.5])
+
+
+def test_it_is_the_generators_rolling_sensor() -> None:
+    """The generator renders row v with the walk's pose at the stamp and the row's time."""
+    from sitegen.walk import Walk
+
+    walk = Walk([(0, 0, 1, 0, 0), (2, 0.2, 1, 0.2, 0), (4, 0, 1.2, 0, 0.1)], 0.75, np.random.default_rng(3), False, 1.0)
+    stamp, step, readout = 1.7, 1e-4, 0.02
+    before, now, after = np.linalg.inv(walk.poses([stamp - step, stamp, stamp + step]))
+    rate = (after - before) / (2 * step)
+    spin = rate[:3, :3] @ now[:3, :3].T
+    angular = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
+    linear = rate[:3, 3] - np.cross(angular, now[:3, 3])
+    inside, pixels = seen(4, CAMERA)
+    motion = RowMotion(readout, 720, linear, angular)
+    rolled = motion.rolled_pixels(pixels, inside, CAMERA)
+    world = (inside - now[:3, 3]) @ now[:3, :3]
+    rows = motion.row_times(rolled[:, 1])
+    assert rows == pytest.approx(((rolled[:, 1] + 0.5) / 720 - 0.5) * readout)
+    poses = np.linalg.inv(walk.poses(stamp + rows))
+    shown = np.einsum("nij,nj->ni", poses[:, :3, :3], world) + poses[:, :3, 3]
+    expected = shown[:, :2] / shown[:, 2:] * 914 + [639.5, 359.5]
+    # What is left is the walk's acceleration within 10 ms: 0.5 m/s^2 x (10 ms)^2 / 2 / 2 m x 914 px = 0.01 px.
+    assert np.abs(expected - rolled).max() < 0.03
+    assert np.abs(expected - pixels).max() > 1.0
+
+
+@pytest.mark.parametrize("readout", [-0.01, 1.0, np.nan, np.inf])
+def test_a_readout_that_no_camera_has_is_refused(readout: float) -> None:
+    with pytest.raises(InputError, match="read-out of"):
+        RowMotion(readout, 720, np.zeros(3), np.zeros(3))
+
+
+def test_a_velocity_of_nan_is_refused() -> None:
+    with pytest.raises(InputError, match="angular velocity"):
+        RowMotion(0.01, 720, np.zeros(3), np.array([0.0, np.nan, 0.0]))
