@@ -22,7 +22,7 @@ PACKAGES := $(wildcard src/*/package.xml src/*/setup.py src/*/setup.cfg src/*/CM
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | while IFS="$$(printf '\t')" read -r name what; do printf '  make %-12s %s\n' "$$name" "$$what"; done
 
-setup: $(VENV)/.workspace $(if $(VIEW),$(VENV)/.view) $(if $(FLEET),$(VENV)/.fleet) $(if $(EXCHANGE),$(VENV)/.exchange) ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter; VIEW=1 adds Open3D for pipeprog view, FLEET=1 Dask for pipeprog fleet, EXCHANGE=1 IFC and DXF)
+setup: $(VENV)/.workspace $(if $(VIEW),$(VENV)/.view) $(if $(FLEET),$(VENV)/.fleet) $(if $(EXCHANGE),$(VENV)/.exchange) $(if $(VIDEO),$(VENV)/.video) ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter; VIEW=1 adds Open3D for pipeprog view, FLEET=1 Dask for pipeprog fleet, EXCHANGE=1 IFC and DXF, VIDEO=1 video in recordings)
 
 $(VENV)/.home:
 	@$(SHELL) setup/check.sh "$(PYTHON)"
@@ -49,6 +49,11 @@ $(VENV)/.fleet: $(VENV)/.packages requirements-fleet.txt requirements-fleet-dev.
 $(VENV)/.exchange: $(VENV)/.packages requirements-exchange.txt
 	@echo "Installing IfcOpenShell and ezdxf (another 250 MB) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-exchange.txt
+	@touch $@
+
+$(VENV)/.video: $(VENV)/.packages requirements-video.txt
+	@echo "Installing PyAV (another 100 MB) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-video.txt
 	@touch $@
 
 $(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(wildcard setup/tf2_msgs/* setup/tf2_msgs/msg/*) $(INTERFACES) $(PACKAGES)

@@ -48,7 +48,18 @@ from pipeprog_sfm.boards.board_file import load_board_file
 from tests.fuzz.attempts import Target
 from tests.fuzz.fuzzed_messages import IMAGES, fuzzed_message, good_messages
 from tests.fuzz.mutated_bytes import mutated
-from tests.unit.bringup.recordings import START, camera_messages, info, jpeg, mcap_bytes, raw_image, sqlite_bytes
+from tests.unit.bringup.recordings import (
+    START,
+    camera_messages,
+    coded_frames,
+    info,
+    jpeg,
+    mcap_bytes,
+    raw_image,
+    sqlite_bytes,
+    video_message,
+    video_messages,
+)
 from tests.unit.detect.plan.ifc_site import write_plan_ifc
 
 ROOT = Path(__file__).parents[2]
@@ -124,6 +135,8 @@ def targets() -> dict[str, Target]:
         Target("image", ".jpg", partial(_damaged, _images), _read_image),
         Target("cdr", ".cdr", partial(_damaged, _recorded_messages), _read_cdr),
     ]
+    if find_spec("av") is not None:
+        files.append(Target("video", ".mcap", partial(_damaged, _videos), _read_bag))
     if find_spec("ifcopenshell") is not None:
         files.append(Target("ifc", ".ifc", partial(_spoiled_text, _ifc_plans), load_boq))
     clouds = [Target(name, f".{name}", partial(_damaged, partial(_clouds, name)), read_cloud) for name in CLOUDS]
@@ -233,6 +246,20 @@ def _databases() -> list[bytes]:
 
 
 @cache
+def _videos() -> list[bytes]:
+    """Recordings of coded frames, neither compressed nor checked, so that damage reaches the decoder."""
+    kinds = (("libx264", cdr.COMPRESSED_VIDEO), ("libx265", cdr.FFMPEG_PACKET), ("libx264", cdr.COMPRESSED_IMAGE))
+    return [
+        mcap_bytes(
+            video_messages(coded_frames(6, encoder, key_every=3), type_name, encoder),
+            CompressionType.NONE,
+            enable_crcs=False,
+        )
+        for encoder, type_name in kinds
+    ]
+
+
+@cache
 def _boqs() -> list[bytes]:
     sizes = b"classes:\n  - {name: A, size: DN 100, planned_length_m: 3}\n"
     diameters = b"classes:\n  - {name: B, outer_diameter_mm: 60, planned_length_m: 2, color: '#ff8800'}\n"
@@ -274,7 +301,8 @@ def _images() -> list[bytes]:
 
 @cache
 def _recorded_messages() -> list[bytes]:
-    return [data for *_, data in camera_messages(2)] + [info(0), raw_image(0)]
+    video = [video_message(name, 0, b"\0\0\1\x65") for name in (cdr.COMPRESSED_VIDEO, cdr.FFMPEG_PACKET)]
+    return [data for *_, data in camera_messages(2)] + [info(0), raw_image(0), *video]
 
 
 CLOUDS = ("ply", "pcd", "las", "laz", "e57", "xyz", "csv")
@@ -357,6 +385,9 @@ def _read_cdr(path: Path) -> None:
     data = path.read_bytes()
     with contextlib.suppress(ValueError, InputError):
         cdr.read_camera_info(data).camera()
+    for type_name in (cdr.COMPRESSED_VIDEO, cdr.FFMPEG_PACKET):
+        with contextlib.suppress(ValueError):
+            cdr.read_image(data, type_name)
     for type_name in (cdr.IMAGE, cdr.COMPRESSED_IMAGE):
         with contextlib.suppress(ValueError, InputError):
             image_size(cdr.read_image(data, type_name), type_name)

@@ -90,6 +90,7 @@ DEPENDENCIES = {
     "mcap": None,
     "mcap_ros2": None,
     "ezdxf": None,
+    "av": None,
     "ifcopenshell": None,
     "open3d": None,
     "openpyxl": None,

@@ -13,7 +13,13 @@ NAN = float("nan")
 DAMAGED = "damaged image"
 UNCALIBRATED = "calibration: no usable CameraInfo has come"
 OTHER_SIZE = "size differs from CameraInfo"
-FAULTS = ("damaged", "stamp", "size", "calibration")  # beginnings of reasons that are faults of the images themselves
+FAULTS = (
+    "damaged",
+    "stamp",
+    "size",
+    "calibration",
+    "video",
+)  # beginnings of reasons that are faults of the images themselves
 UNMATCHED = "shows nothing of the frames before and after it"
 JUMP = "shows nothing of the frames before it"
 

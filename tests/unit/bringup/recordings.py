@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import io
 import sqlite3
+import struct
 import tempfile
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -93,6 +95,71 @@ def camera_messages(count: int, prefix: str = "/camera") -> list[tuple[str, str,
         log_time = START + number * STEP
         messages.append((f"{prefix}/camera_info", cdr.CAMERA_INFO, log_time, info(number)))
         messages.append((f"{prefix}/image/compressed", cdr.COMPRESSED_IMAGE, log_time, image(number)))
+    return messages
+
+
+def pictures(count: int) -> list[np.ndarray]:
+    """Smooth pictures (48, 64, 3) that move, so that coded frames refer to each other."""
+    noise = np.random.default_rng(0).integers(0, 255, (48, 64 + 2 * count, 3), np.uint8)
+    wide = cv2.GaussianBlur(noise, (0, 0), 3)
+    return [np.ascontiguousarray(wide[:, 2 * n : 2 * n + 64]) for n in range(count)]
+
+
+def coded_frames(count: int, encoder: str = "libx264", key_every: int = 8) -> list[bytes]:
+    """The pictures as video, one frame each, without frames that refer to later ones; PyAV must be installed."""
+    import av
+
+    context = av.CodecContext.create(encoder, "w")
+    context.width, context.height, context.pix_fmt = 64, 48, "yuv444p" if encoder == "libx264" else "yuv420p"
+    context.time_base, context.gop_size = Fraction(1, 30), key_every
+    context.options = {"tune": "zerolatency", "preset": "ultrafast", "crf": "10"}
+    if encoder == "libx265":
+        context.options |= {"x265-params": f"log-level=none:keyint={key_every}"}
+    coded = []
+    for number, picture in enumerate(pictures(count)):
+        frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+        frame.pts = number
+        coded += [bytes(packet) for packet in context.encode(frame)]
+    return coded + [bytes(packet) for packet in context.encode(None)]
+
+
+def video_message(type_name: str, number: int, coded: bytes, codec: str = "h264") -> bytes:
+    """CDR bytes of one coded frame, as foxglove_msgs, ffmpeg_image_transport or sensor_msgs lay them out."""
+    if type_name == cdr.COMPRESSED_IMAGE:
+        return cdr.write_compressed_image(START + number * STEP, "camera", codec, coded)
+    cdr_bytes = bytearray(b"\0\1\0\0" + struct.pack("<iI", *divmod(START + number * STEP, 10**9)))
+
+    def add(kind: str, *numbers: int) -> None:
+        cdr_bytes.extend(bytes(-len(cdr_bytes[4:]) % struct.calcsize(kind)) + struct.pack(f"<{kind}", numbers[0]))
+        for one in numbers[1:]:
+            add(kind, one)
+
+    def add_bytes(content: bytes) -> None:
+        add("I", len(content))
+        cdr_bytes.extend(content)
+
+    add_bytes(b"camera\0")
+    if type_name == cdr.COMPRESSED_VIDEO:
+        add_bytes(coded)
+        add_bytes(codec.encode() + b"\0")
+    else:
+        add("i", 64, 48)
+        add_bytes(codec.encode() + b";yuv420p;bgr8;bgr8\0")
+        add("Q", number)
+        add("B", 0, 0)
+        add_bytes(coded)
+    return bytes(cdr_bytes)
+
+
+def video_messages(
+    coded: list[bytes], type_name: str = cdr.COMPRESSED_VIDEO, codec: str = "h264"
+) -> list[tuple[str, str, int, bytes]]:
+    """CameraInfo and coded frames of one camera."""
+    messages = []
+    for number, frame in enumerate(coded):
+        log_time = START + number * STEP
+        messages.append(("/camera/camera_info", cdr.CAMERA_INFO, log_time, info(number)))
+        messages.append(("/camera/video", type_name, log_time, video_message(type_name, number, frame, codec)))
     return messages
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings: the images of one camera with its calibration, from an .mcap or .db3 file or a rosbag2 folder."""
+"""Recordings: the images of one camera with its calibration, from an .mcap or .db3 file or a rosbag2 folder.
+
+Video is decoded on the way: it gives raw images.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from pipeprog_bringup.recording.mcap_file import McapFile
 from pipeprog_bringup.recording.message_file import MessageFile, messages_of, tagged_messages
 from pipeprog_bringup.recording.sqlite_file import MAGIC, SqliteFile
 from pipeprog_bringup.recording.topic_choice import IMAGE_TYPES, TF_STATIC, choose_camera, choose_motion
+from pipeprog_bringup.recording.video_stream import VideoStream, video_codec
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_TRIED_IMAGES
@@ -38,7 +42,7 @@ class Bag:
 
     path: Path
     image_topic: str
-    image_type: str
+    image_type: str  # of the images that come out
     camera_info_topic: str
     image_count: int
     camera: Camera
@@ -48,6 +52,8 @@ class Bag:
     _files: tuple[MessageFile, ...]
     _first_calibration: Calibration
     _left_out: Counter[str]  # messages of the last pass that are damaged, by topic
+    _recorded_type: str  # of the image topic; other than image_type where it is video
+    _codec: str  # of that video; empty: pictures
 
     @classmethod
     def open(
@@ -68,12 +74,14 @@ class Bag:
         image_topic, info_topic = choose_camera(path, files, counts, types, image_topic, camera_info_topic)
         infos = (message.data for message in messages_of(files, {info_topic}))
         first_calibration, camera = _first_camera(path, info_topic, infos)
+        images = (message.data for message in messages_of(files, {image_topic}))
+        codec = video_codec(image_topic, types[image_topic], images)
         motion, notes = choose_motion(path, types, odometry_topic, imu_topic)
         motion_types = {topic: types[topic] for topic in motion}
         bag = cls(
             path,
             image_topic,
-            types[image_topic],
+            cdr.IMAGE if codec else types[image_topic],
             info_topic,
             counts[image_topic],
             camera,
@@ -83,6 +91,8 @@ class Bag:
             files,
             first_calibration,
             Counter(),
+            types[image_topic],
+            codec,
         )
         bag._check_images()
         return bag
@@ -101,14 +111,19 @@ class Bag:
 
     def _stream(self, motion: set[str]) -> Iterator[ImageMessage | MotionMessage]:
         check = FrameCheck(self.image_type, self.camera_info_topic, self._first_calibration)
+        video = VideoStream(self._recorded_type, self._codec, check) if self._codec else None
         for topic, message in tagged_messages(self._files, {self.image_topic, self.camera_info_topic, *motion}):
             if topic in motion:
                 yield MotionMessage(self.motion_topics[topic], self._motion_types[topic], message.data)
             elif topic == self.camera_info_topic:
                 check.calibrate(message.data)
                 self._left_out[topic] = check.damaged
+            elif video:
+                yield from video.take(message.data, message.log_time)
             else:
                 yield check.image(message.data, message.log_time)
+        if video:
+            yield from video.finish()
 
     @property
     def losses(self) -> list[str]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from mcap_ros2.writer import serialize_dynamic
+from numpy.typing import NDArray
 
 from pipeprog_bringup.recording.definitions import message_definition
 from pipeprog_camera.camera import Camera, check_whole_sensor
@@ -24,6 +25,8 @@ from pipeprog_camera.limits import MAX_DISTORTION_COEFFICIENTS, MAX_NAME, MAX_SE
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+COMPRESSED_VIDEO = "foxglove_msgs/msg/CompressedVideo"
+FFMPEG_PACKET = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
@@ -65,7 +68,8 @@ class CameraInfo:
 class ImageFields:
     """An image message: stamp [ns], frame, the format of a compressed image or the encoding of a raw one, its bytes.
 
-    `width`, `height` [px] and `step` [bytes of a row] are those of a raw image, 0 of a compressed one.
+    `width`, `height` [px] and `step` [bytes of a row] are those of a raw image, 0 of a compressed one. Of video the
+    format is the codec, and the bytes are those of one coded frame.
     """
 
     stamp: int
@@ -142,7 +146,7 @@ def read_camera_info(data: bytes) -> CameraInfo:
 
 
 def read_image(data: bytes, type_name: str) -> ImageFields:
-    """An Image or CompressedImage from its CDR bytes, read to its end; ValueError where they are damaged.
+    """An image message of any type from its CDR bytes, read to its end; ValueError where they are damaged.
 
     The pixels are not decoded. Raises StampError where only the stamp cannot be used.
     """
@@ -150,6 +154,15 @@ def read_image(data: bytes, type_name: str) -> ImageFields:
     stamp, frame_id = reader.header()
     if type_name == COMPRESSED_IMAGE:
         return ImageFields(stamp, frame_id, reader.string(), reader.bytes())
+    if type_name == COMPRESSED_VIDEO:
+        data = reader.bytes()
+        return ImageFields(stamp, frame_id, reader.string(), data)
+    if type_name == FFMPEG_PACKET:
+        reader.numbers("i", 2)  # width and height, which the stream itself has
+        codec = reader.string().partition(";")[0]
+        reader.number("Q")  # presentation time in units of the encoder
+        reader.numbers("B", 2)  # flags, is_bigendian
+        return ImageFields(stamp, frame_id, codec, reader.bytes())
     height, width = reader.numbers("I", 2)
     encoding = reader.string()
     reader.number("B")  # is_bigendian
@@ -170,6 +183,21 @@ def header(stamp: int, frame_id: str) -> dict[str, Any]:
 def write_compressed_image(stamp: int, frame_id: str, image_format: str, encoded: bytes) -> bytes:
     """CDR bytes of a CompressedImage."""
     return write(COMPRESSED_IMAGE, {"header": header(stamp, frame_id), "format": image_format, "data": encoded})
+
+
+def write_image(stamp: int, frame_id: str, encoding: str, pixels: NDArray[np.uint8 | np.uint16]) -> bytes:
+    """CDR bytes of an Image of (H, W) or (H, W, 3) pixels; by hand, since a general encoder takes seconds for them."""
+    height, width = pixels.shape[:2]
+    step = pixels.nbytes // height
+    head = struct.pack("<iI", *divmod(stamp, NANOSECONDS)) + _text(frame_id)
+    head += bytes(-len(head) % 4) + struct.pack("<II", height, width) + _text(encoding) + b"\0"  # is_bigendian
+    head += bytes(-len(head) % 4) + struct.pack("<II", step, pixels.nbytes)
+    return _LITTLE_ENDIAN + b"\0\0" + head + np.ascontiguousarray(pixels).tobytes()
+
+
+def _text(value: str) -> bytes:
+    encoded = value.encode() + b"\0"
+    return struct.pack("<I", len(encoded)) + encoded
 
 
 def write_camera_info(stamp: int, frame_id: str, camera: Camera) -> bytes:

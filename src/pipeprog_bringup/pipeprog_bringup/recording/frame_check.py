@@ -92,6 +92,10 @@ class FrameCheck:
         calibration = self._latest.get(image.frame_id, self._newest)
         return ImageMessage(image.stamp, image.frame_id, data, calibration.data, self._fault(image, calibration))
 
+    def left_out(self, stamp: int, frame_id: str, fault: str) -> ImageMessage:
+        """An image that is not there, for the reason `fault`."""
+        return ImageMessage(stamp, frame_id, b"", self._newest.data, fault)
+
     def _fault(self, image: cdr.ImageFields, calibration: Calibration) -> str:
         try:
             width, height = image_size(image, self._image_type)

@@ -11,8 +11,10 @@ from pipeprog_bringup.recording.message_file import MessageFile, messages_of
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CAMERAS
 
-IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE)
+# Of one picture in several of these, the first is read.
+IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE, cdr.COMPRESSED_VIDEO, cdr.FFMPEG_PACKET)
 TF, TF_STATIC = "/tf", "/tf_static"
+_TRANSPORTS = ("compressed", "ffmpeg", "foxglove")  # of image_transport
 _LISTED = 20  # topics that an error names
 # Depth and disparity images have the same message types as pictures; no camera's picture has these encodings.
 _DEPTH_ENCODINGS = ("16UC1", "32FC1", "32FC2")
@@ -35,17 +37,19 @@ def choose_camera(
     if image_topic is None:
         few = len(images) <= MAX_CAMERAS  # each is looked into; of more the error names some in any case
         cameras = [topic for topic in images if not (few and _is_depth(files, topic, types[topic]))]
-        # The same picture is often recorded raw and compressed; frames passes keyframes on compressed in any case.
-        cameras = [
-            topic for topic in cameras if types[topic] == cdr.COMPRESSED_IMAGE or f"{topic}/compressed" not in cameras
-        ]
+        # The same picture is often recorded several times; frames passes keyframes on compressed in any case.
+        rank = {topic: IMAGE_TYPES.index(types[topic]) for topic in cameras}
+        best = {_base(topic): min(rank[same] for same in cameras if _base(same) == _base(topic)) for topic in cameras}
+        cameras = [topic for topic in cameras if rank[topic] == best[_base(topic)]]
         if info_topic is not None:
             cameras = [topic for topic in cameras if info_topic in _own_infos(files, topic, types, infos)] or cameras
     else:
         cameras = [image_topic]
     if not cameras:
         kinds = _listed([f"{topic} ({name or 'no type'})" for topic, name in sorted(types.items())])
-        raise InputError(f"{path} holds no images (sensor_msgs Image or CompressedImage): its topics are {kinds}")
+        raise InputError(
+            f"{path} holds no images (sensor_msgs Image or CompressedImage, or video): its topics are {kinds}"
+        )
     if not infos:
         raise InputError(
             f"{path} holds images on {_listed(cameras)} but no sensor_msgs/CameraInfo: record that topic too"
@@ -101,7 +105,7 @@ def _own_infos(files: tuple[MessageFile, ...], image_topic: str, types: dict[str
     image_transport has camera/camera_info beside camera/image and camera/image/compressed; Spot's driver has
     frontleft/camera_info beside frontleft/compressed.
     """
-    base = image_topic.removesuffix("/compressed")
+    base = _base(image_topic)
     beside = [f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info"]
     named = [topic for topic in beside if topic in infos]
     if len(infos) == 1 or len(named) == 1:
@@ -109,6 +113,12 @@ def _own_infos(files: tuple[MessageFile, ...], image_topic: str, types: dict[str
     frame = _frame(files, image_topic, types[image_topic])
     same = [topic for topic in (named or infos) if frame and _frame(files, topic, cdr.CAMERA_INFO) == frame]
     return same if len(same) == 1 else named[:1] or infos
+
+
+def _base(image_topic: str) -> str:
+    """The topic that image_transport would publish the raw images on."""
+    base, _, transport = image_topic.rpartition("/")
+    return base if transport in _TRANSPORTS else image_topic
 
 
 def _frame(files: tuple[MessageFile, ...], topic: str, type_name: str) -> str:
