@@ -56,6 +56,8 @@ from tests.unit.bringup.recordings import (
     jpeg,
     mcap_bytes,
     raw_image,
+    ros1_bytes,
+    ros1_camera_messages,
     sqlite_bytes,
     video_message,
     video_messages,
@@ -125,6 +127,7 @@ def targets() -> dict[str, Target]:
     files = [
         Target("bag", ".mcap", partial(_damaged, _bags), _read_bag),
         Target("sqlite", ".db3", partial(_damaged, _databases), _read_bag),
+        Target("ros1", ".bag", partial(_damaged, _ros1_bags), _read_bag),
         Target("boq", ".yaml", partial(_spoiled_text, _boqs), load_boq),
         Target("boq_csv", ".csv", partial(_spoiled_text, _bill_tables), load_boq),
         Target("boq_xlsx", ".xlsx", partial(_damaged, _workbooks), load_boq),
@@ -243,6 +246,12 @@ def _workbooks() -> list[bytes]:
 @cache
 def _databases() -> list[bytes]:
     return [sqlite_bytes(camera_messages(3)), sqlite_bytes(camera_messages(1))]
+
+
+@cache
+def _ros1_bags() -> list[bytes]:
+    kinds = (("none", True), ("none", False), ("bz2", True), ("lz4", False))
+    return [ros1_bytes(ros1_camera_messages(3), compression, index, 3) for compression, index in kinds]
 
 
 @cache

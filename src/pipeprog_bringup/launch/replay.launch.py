@@ -19,7 +19,7 @@ from launch.substitutions import LaunchConfiguration
 ARGUMENTS = [
     DeclareLaunchArgument("boq", description="Bill of quantities: YAML file of the planned pipe classes."),
     DeclareLaunchArgument(
-        "bag", default_value="", description="Recording to play: an .mcap or .db3 file or a rosbag2 folder."
+        "bag", default_value="", description="Recording to play: an .mcap, .db3 or .bag file or a rosbag2 folder."
     ),
     DeclareLaunchArgument("rate", default_value="1.0", description="Speed of the player; 1.0 is the time of the site."),
     DeclareLaunchArgument(

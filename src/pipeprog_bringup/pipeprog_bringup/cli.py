@@ -48,7 +48,7 @@ def options(version: Annotated[bool, typer.Option("--version", help="Print the v
 
 @app.command(rich_help_panel="From recordings")
 def replay(
-    bag: Annotated[Path, typer.Argument(help="Recording: an .mcap or .db3 file or a rosbag2 folder.")],
+    bag: Annotated[Path, typer.Argument(help="Recording: an .mcap, .db3 or .bag file or a rosbag2 folder.")],
     boq: Boq,
     out: Out,
     board: Annotated[

@@ -28,7 +28,17 @@ DISTORTION_MODELS: dict[str, tuple[int, ...]] = {
     "rational_polynomial": (8, 12, 14),
     "equidistant": (4,),
 }
-_ALIASES = {"": "plumb_bob", "radtan": "plumb_bob", "fisheye": "equidistant", "none": "plumb_bob"}
+_ALIASES = {
+    "": "plumb_bob",
+    "radtan": "plumb_bob",
+    "fisheye": "equidistant",
+    "none": "plumb_bob",
+    # RealSense's SDK; its inverse model is taken where the coefficients are zero, as those of most of its cameras are.
+    "None": "plumb_bob",
+    "Brown Conrady": "plumb_bob",
+    "Kannala Brandt4": "equidistant",
+}
+_INVERSE = "Inverse Brown Conrady"
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,7 @@ class Camera:
                 "calibrate it and fill K of its CameraInfo"
             )
         model = _ALIASES.get(self.distortion_model, self.distortion_model)
+        model = "plumb_bob" if model == _INVERSE and not any(self.distortion) else model
         if model not in DISTORTION_MODELS:
             raise InputError(
                 f"unknown distortion model {self.distortion_model[:40]!r}: use one of {', '.join(DISTORTION_MODELS)}"

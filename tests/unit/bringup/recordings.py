@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import bz2
 import io
 import sqlite3
 import struct
@@ -11,6 +12,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import cv2
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
@@ -161,6 +163,75 @@ def video_messages(
         messages.append(("/camera/camera_info", cdr.CAMERA_INFO, log_time, info(number)))
         messages.append(("/camera/video", type_name, log_time, video_message(type_name, number, frame, codec)))
     return messages
+
+
+def ros1_header(number: int, frame_id: str = "camera") -> bytes:
+    """The header of a message of ROS 1."""
+    stamp = struct.pack("<II", *divmod(START + number * STEP, 10**9))
+    return struct.pack("<I", number) + stamp + ros1_text(frame_id)
+
+
+def ros1_text(value: str | bytes) -> bytes:
+    """A text or sequence of bytes of ROS 1."""
+    encoded = value.encode() if isinstance(value, str) else value
+    return struct.pack("<I", len(encoded)) + encoded
+
+
+def ros1_camera_messages(count: int, model: str = "plumb_bob") -> list[tuple[str, str, int, bytes]]:
+    """The messages of `camera_messages`, of ROS 1."""
+    messages = []
+    for number in range(count):
+        k = CAMERA.matrix.ravel()
+        calibration = ros1_header(number) + struct.pack("<II", 48, 64) + ros1_text(model)
+        calibration += struct.pack("<I9d9d12d", 0, *k, *np.eye(3).ravel(), *np.eye(3, 4).ravel())
+        picture = ros1_header(number) + ros1_text("jpeg") + ros1_text(jpeg(number))
+        log_time = START + number * STEP
+        messages.append(("/camera/camera_info", "sensor_msgs/CameraInfo", log_time, calibration + bytes(25)))
+        messages.append(("/camera/image/compressed", "sensor_msgs/CompressedImage", log_time, picture))
+    return messages
+
+
+def ros1_bytes(
+    messages: list[tuple[str, str, int, bytes]], compression: str = "none", index: bool = True, a_chunk: int = 10
+) -> bytes:
+    """A ROS 1 bag of (topic, type, log time, data) messages, in chunks of ten."""
+
+    def record(data: bytes, **fields: bytes) -> bytes:
+        header = b"".join(ros1_text(name.encode() + b"=" + value) for name, value in fields.items())
+        return ros1_text(header) + ros1_text(data)
+
+    topics = {topic: type_name for topic, type_name, *_ in messages}
+    numbers = {topic: struct.pack("<I", at) for at, topic in enumerate(topics)}
+    connections = {
+        topic: record(
+            b"".join(ros1_text(f"{key}={value}") for key, value in (("topic", topic), ("type", type_name))),
+            op=b"\7",
+            conn=numbers[topic],
+            topic=topic.encode(),
+        )
+        for topic, type_name in topics.items()
+    }
+    content = b""
+    told: set[str] = set()
+    for start in range(0, len(messages), a_chunk):
+        chunk = b""
+        entries: dict[str, bytes] = {}
+        for topic, _, log_time, data in messages[start : start + a_chunk]:
+            time = struct.pack("<II", *divmod(log_time, 10**9))
+            chunk += b"" if topic in told else connections[topic]
+            told.add(topic)
+            entries[topic] = entries.get(topic, b"") + time + struct.pack("<I", len(chunk))
+            chunk += record(data, op=b"\2", conn=numbers[topic], time=time)
+        packed = {"none": bytes, "bz2": bz2.compress, "lz4": lz4.frame.compress}[compression](chunk)
+        size = struct.pack("<I", len(chunk))
+        content += record(packed, op=b"\5", compression=compression.encode(), size=size)
+        if index:
+            for topic, times in entries.items():
+                count = struct.pack("<I", len(times) // 12)
+                content += record(times, op=b"\4", ver=struct.pack("<I", 1), conn=numbers[topic], count=count)
+    end = b"".join(connections.values()) if index else b""
+    head = record(b" " * 4000, op=b"\3", index_pos=bytes(8), conn_count=bytes(4), chunk_count=bytes(4))
+    return b"#ROSBAG V2.0\n" + head + content + end
 
 
 def write_bag(path: Path, messages: list[tuple[str, str, int, bytes]] | None = None) -> Path:

@@ -11,7 +11,7 @@ from pipeprog_bringup.fleet.storage import Mark, Place
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_NAME
 
-_ENDINGS = (".mcap", ".db3")
+_ENDINGS = (".mcap", ".db3", ".bag")
 _FOLDER_FILE = "metadata.yaml"  # by which a rosbag2 folder is known
 _GLOB = re.compile(r"[*?[]")
 _NO_NAME = re.compile(r"[^\w .()+-]")  # characters that a path, an address or a page would have to escape
@@ -54,16 +54,18 @@ class Recording:
 def listed(address: str, inputs: Inputs, name: str = "") -> list[Recording]:
     """The recordings at an address, in the order of their names.
 
-    A file is one recording, whatever it holds; so is a rosbag2 folder. Of any other folder these are the .mcap and
-    .db3 files and rosbag2 folders below it, of a glob the files and folders that fit. `name` is that of a single
-    recording. Raises InputError where there is none, or `name` is given to several, and StorageFailure.
+    A file is one recording, whatever it holds; so is a rosbag2 folder. Of any other folder these are the .mcap,
+    .db3 and .bag files and rosbag2 folders below it, of a glob the files and folders that fit. `name` is that of a
+    single recording. Raises InputError where there is none, or `name` is given to several, and StorageFailure.
     """
     if _GLOB.search(address):
         found = [one for match in Place(address).matches() for one in _at(match, inputs)]
     else:
         found = _at(address, inputs)
     if not found:
-        raise InputError(f"{address}: holds no recording (an .mcap or .db3 file or a rosbag2 folder): check the path")
+        raise InputError(
+            f"{address}: holds no recording (an .mcap, .db3 or .bag file or a rosbag2 folder): check the path"
+        )
     if name and len(found) > 1:
         raise InputError(f"{address}: the name '{name}' stands for {len(found)} recordings: leave it out")
     return [Recording(_fit(name), found[0].uri, found[0].files, inputs)] if name else found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings: the images of one camera with its calibration, from an .mcap or .db3 file or a rosbag2 folder.
+"""Recordings: the images of one camera with its calibration, from an .mcap, .db3 or .bag file or a rosbag2 folder.
 
 Video is decoded on the way: it gives raw images.
 """
@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from pipeprog_bringup.recording import cdr
+from pipeprog_bringup.recording import cdr, ros1_file, sqlite_file
 from pipeprog_bringup.recording.bag_folder import parts
 from pipeprog_bringup.recording.frame_check import Calibration, FrameCheck, ImageMessage
 from pipeprog_bringup.recording.mcap_file import McapFile
 from pipeprog_bringup.recording.message_file import MessageFile, messages_of, tagged_messages
-from pipeprog_bringup.recording.sqlite_file import MAGIC, SqliteFile
+from pipeprog_bringup.recording.ros1_file import Ros1File
+from pipeprog_bringup.recording.sqlite_file import SqliteFile
 from pipeprog_bringup.recording.topic_choice import IMAGE_TYPES, TF_STATIC, choose_camera, choose_motion
 from pipeprog_bringup.recording.video_stream import VideoStream, video_codec
 from pipeprog_camera.camera import Camera
@@ -25,6 +26,8 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_TRIED_IMAGES
 
 _USED_TYPES = {*IMAGE_TYPES, cdr.CAMERA_INFO, cdr.ODOMETRY, cdr.IMU, cdr.TF}
+
+_FORMATS: dict[bytes, type[SqliteFile] | type[Ros1File]] = {sqlite_file.MAGIC: SqliteFile, ros1_file.MAGIC: Ros1File}
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,9 @@ class Bag:
 def _opened(path: Path) -> MessageFile:
     """The file in the format that its first bytes say, whatever it is called."""
     with path.open("rb") as stream:
-        is_sqlite = stream.read(len(MAGIC)) == MAGIC
-    return SqliteFile.open(path) if is_sqlite else McapFile.open(path)
+        beginning = stream.read(max(map(len, _FORMATS)))
+    kinds = [kind for magic, kind in _FORMATS.items() if beginning.startswith(magic)]
+    return kinds[0].open(path) if kinds else McapFile.open(path)
 
 
 def _topics(files: tuple[MessageFile, ...], path: Path) -> tuple[Counter[str], dict[str, str]]:
@@ -158,8 +162,6 @@ def _topics(files: tuple[MessageFile, ...], path: Path) -> tuple[Counter[str], d
         for channel_id, channel in file.channels.items():
             if not file.counts[channel_id]:
                 continue
-            if channel.encoding == "ros1":
-                raise InputError(f"{file.path} is a ROS 1 recording: convert it to ROS 2 (message encoding cdr)")
             counts[channel.topic] += file.counts[channel_id]
             known = types.setdefault(channel.topic, channel.type_name)
             if known != channel.type_name and {known, channel.type_name} & _USED_TYPES:

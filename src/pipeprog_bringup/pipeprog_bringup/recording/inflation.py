@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import bz2
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import FREE_CONTENT, FREE_RECORDS, MAX_CHUNK, MAX_INFLATION, MIN_BYTES_OF_A_RECORD
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-COMPRESSIONS = ("", "lz4", "zstd")
+COMPRESSIONS = ("", "lz4", "zstd")  # of mcap
 _PIECE = 1 << 16  # bytes handled at a time: of a damaged stream what lies before the fault is kept
 
 
@@ -46,14 +47,14 @@ class Allowance:
 
 
 def inflate(data: bytes, compression: str, limit: int) -> bytes:
-    """At most `limit` bytes of one of COMPRESSIONS; of a torn or damaged stream what lies before the fault."""
+    """At most `limit` bytes of one of COMPRESSIONS or bz2; of a torn or damaged stream what lies before the fault."""
     if not compression:
         return data[:limit]
     pieces = bytearray()
     # The fault's type differs from library to library (zstandard.ZstdError, RuntimeError, EOFError); all derive from
     # Exception alone, and each means that the rest of the stream cannot be decoded.
     with contextlib.suppress(Exception):
-        for piece in _zstd(data) if compression == "zstd" else _lz4(data):
+        for piece in {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}[compression](data):
             pieces += piece
             if len(pieces) >= limit:
                 break
@@ -104,3 +105,11 @@ def _lz4(data: bytes) -> Iterator[bytes]:
             yield piece
             if decompressor.needs_input or not piece:
                 break
+
+
+def _bz2(data: bytes) -> Iterator[bytes]:
+    decompressor = bz2.BZ2Decompressor()
+    piece = decompressor.decompress(data, max_length=_PIECE)
+    while piece:
+        yield piece
+        piece = b"" if decompressor.eof else decompressor.decompress(b"", max_length=_PIECE)

@@ -159,8 +159,6 @@ class McapFile:
 
 
 def _other_format(magic: bytes) -> str:
-    if magic.startswith(b"#ROSBAG"):
-        return " but a ROS 1 bag: convert it with `mcap convert in.bag out.mcap`"
     if magic.startswith(ZSTD_MAGIC):
         return " but zstd-compressed as a whole: decompress it with `zstd -d`"
-    return ": give an .mcap or .db3 file or a rosbag2 folder (videos go through `pipeprog ingest` first)"
+    return ": give an .mcap, .db3 or .bag file or a rosbag2 folder (videos go through `pipeprog ingest` first)"

@@ -24,6 +24,8 @@ from mcap.opcode import Opcode
 
 from pipeprog_bringup.recording.inflation import COMPRESSIONS, Allowance
 from pipeprog_bringup.recording.message_file import Channel
+from pipeprog_bringup.recording.ros1_messages import ENCODING as ROS1
+from pipeprog_bringup.recording.ros1_messages import ros2_type
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CHANNELS, MAX_CHUNK, MAX_DESCRIPTION, MAX_NAME
 
@@ -165,6 +167,8 @@ class Walk:
             else:
                 channel = records.Channel.read(stream)
                 type_name = self._schemas.get(channel.schema_id, "")
+                if channel.message_encoding == ROS1:
+                    type_name = ros2_type(type_name)
                 if _is_name(channel.topic):
                     self.channels[channel.id] = Channel(channel.topic, type_name, channel.message_encoding)
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
+
+from pipeprog_bringup.recording.ros1_messages import ENCODING as ROS1
+from pipeprog_bringup.recording.ros1_messages import to_cdr
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A topic of the file: its message type and how its messages are encoded."""
+    """A topic of the file: its message type, by its name in ROS 2, and how its messages are encoded."""
 
     topic: str
     type_name: str
@@ -50,8 +53,11 @@ def messages_of(files: tuple[MessageFile, ...], topics: set[str]) -> Iterator[Me
 
 
 def tagged_messages(files: tuple[MessageFile, ...], topics: set[str]) -> Iterator[tuple[str, Message]]:
-    """As `messages_of`, each with its topic."""
+    """As `messages_of`, each with its topic; messages of ROS 1 as those of ROS 2."""
     for file in files:
-        names = {number: channel.topic for number, channel in file.channels.items() if channel.topic in topics}
-        for message in file.messages(set(names)):
-            yield names[message.channel_id], message
+        wanted = {number: channel for number, channel in file.channels.items() if channel.topic in topics}
+        for message in file.messages(set(wanted)):
+            channel = wanted[message.channel_id]
+            if channel.encoding == ROS1:
+                message = replace(message, data=to_cdr(channel.type_name, message.data))
+            yield channel.topic, message

@@ -15,6 +15,7 @@ from pipeprog_camera.limits import MAX_CAMERAS
 IMAGE_TYPES = (cdr.COMPRESSED_IMAGE, cdr.IMAGE, cdr.COMPRESSED_VIDEO, cdr.FFMPEG_PACKET)
 TF, TF_STATIC = "/tf", "/tf_static"
 _TRANSPORTS = ("compressed", "ffmpeg", "foxglove")  # of image_transport
+_REALSENSE = "/image/data"  # what the SDK of RealSense adds to the name of a stream
 _LISTED = 20  # topics that an error names
 # Depth and disparity images have the same message types as pictures; no camera's picture has these encodings.
 _DEPTH_ENCODINGS = ("16UC1", "32FC1", "32FC2")
@@ -103,10 +104,12 @@ def _own_infos(files: tuple[MessageFile, ...], image_topic: str, types: dict[str
     """The camera_info topics that may belong to an image topic: one where the names or the frames tell, else all.
 
     image_transport has camera/camera_info beside camera/image and camera/image/compressed; Spot's driver has
-    frontleft/camera_info beside frontleft/compressed.
+    frontleft/camera_info beside frontleft/compressed, RealSense's SDK Color_0/info/camera_info for Color_0/image/data.
     """
     base = _base(image_topic)
     beside = [f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info"]
+    if base.endswith(_REALSENSE):
+        beside = [f"{base.removesuffix(_REALSENSE)}/info/camera_info"]
     named = [topic for topic in beside if topic in infos]
     if len(infos) == 1 or len(named) == 1:
         return named or infos
@@ -136,6 +139,8 @@ def _frame(files: tuple[MessageFile, ...], topic: str, type_name: str) -> str:
 
 
 def _is_depth(files: tuple[MessageFile, ...], topic: str, type_name: str) -> bool:
+    if topic.endswith(_REALSENSE) and "/Depth_" in topic:  # encoded as mono16
+        return True
     first = next(messages_of(files, {topic}), None)
     try:
         encoding = cdr.read_image(first.data, type_name).encoding if first else ""

@@ -260,7 +260,7 @@ def test_recordings_that_hold_nothing_to_use_are_errors(tmp_path: Path) -> None:
         "no sensor_msgs/CameraInfo": write_bag(tmp_path / "images.mcap", only[cdr.COMPRESSED_IMAGE]),
         "is empty": tmp_path / "zero.mcap",
         "is not an mcap file": tmp_path / "text.mcap",
-        "ROS 1": tmp_path / "ros1.bag",
+        "ROS 1 bag of another format": tmp_path / "ros1.bag",
         "no metadata.yaml": tmp_path / "folder",
         "stored as 'rocksdb'": folder(tmp_path / "rocks", [b""], storage_identifier="rocksdb"),
         "no rosbag2 metadata": folder(tmp_path / "odd", [b""]),
@@ -272,7 +272,7 @@ def test_recordings_that_hold_nothing_to_use_are_errors(tmp_path: Path) -> None:
     }
     (tmp_path / "zero.mcap").write_bytes(b"")
     (tmp_path / "text.mcap").write_text("hello")
-    (tmp_path / "ros1.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "ros1.bag").write_bytes(b"#ROSBAG V1.2\n")
     (tmp_path / "folder").mkdir()
     (tmp_path / "odd" / "metadata.yaml").write_text("[")
     for expected, path in cases.items():
