@@ -26,7 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads do not survive a f
 from benchmarks.limited import Outcome, count_and_seed, try_files, write_tried
 from benchmarks.recordings import ROOT
 from pipeprog_bringup.console import print_progress, print_score
-from pipeprog_bringup.ingest import read_camera
+from pipeprog_bringup.footage.camera_file import read_camera_file
 from pipeprog_bringup.recording.bag_folder import parts
 from pipeprog_bringup.results.result_files import write_progress
 from pipeprog_bringup.results.results_reader import read_results
@@ -136,7 +136,7 @@ def _beside(path: Path, name: str) -> Path:
 _USES: dict[str, Callable[[Path], object]] = {
     "boq.yaml": _use_boq,
     "board.yaml": lambda path: layouts(load_board_file(path).boards),
-    "camera.yaml": read_camera,
+    "camera.yaml": read_camera_file,
     "metadata.yaml": _use_metadata,
     "pipes.json": _use_results,
     "truth.json": _use_truth,

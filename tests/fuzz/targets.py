@@ -33,7 +33,7 @@ from pypcd4 import Encoding, PointCloud
 from rclpy.serialization import deserialize_message, serialize_message
 
 from pipeprog_bringup.export.control_points import load_control_points
-from pipeprog_bringup.ingest import read_camera
+from pipeprog_bringup.footage.camera_file import read_camera_file
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.frame_check import image_size
@@ -133,7 +133,7 @@ def targets() -> dict[str, Target]:
         Target("boq_xlsx", ".xlsx", partial(_damaged, _workbooks), load_boq),
         Target("points", ".yaml", partial(_spoiled_text, _control_points), load_control_points),
         Target("board", ".yaml", partial(_spoiled_text, _boards), load_board_file),
-        Target("calibration", ".yaml", partial(_spoiled_text, _calibrations), read_camera),
+        Target("calibration", ".yaml", partial(_spoiled_text, _calibrations), read_camera_file),
         Target("metadata", ".yaml", partial(_spoiled_text, _metadata), _read_folder),
         Target("image", ".jpg", partial(_damaged, _images), _read_image),
         Target("cdr", ".cdr", partial(_damaged, _recorded_messages), _read_cdr),
@@ -292,6 +292,7 @@ def _calibrations() -> list[bytes]:
         "camera_matrix": {"rows": 3, "cols": 3, "data": [150.0, 0, 79.5, 0, 150.0, 47.5, 0, 0, 1]},
         "distortion_model": "plumb_bob",
         "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.1, -0.05, 0, 0, 0]},
+        "readout": 0.015,
     }
     return [yaml.safe_dump(content).encode()]
 

@@ -58,6 +58,7 @@ FOLDERS = {
     "pipeprog_bringup": {
         "recording": set(),
         "clouds": set(),
+        "footage": set(),
         "results": {"clouds"},
         "export": {"recording", "results"},
         "report": {"recording", "results"},

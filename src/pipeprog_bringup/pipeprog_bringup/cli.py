@@ -6,6 +6,7 @@ Modules that take long to import are imported inside the commands, so that --hel
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -188,14 +189,22 @@ def ingest(
     ],
     out: Annotated[Path, typer.Option("--out", help="The recording to write.", metavar="BAG.mcap")],
     quality: Annotated[int, typer.Option(min=50, max=100, help="JPEG quality.")] = 95,
+    start: Annotated[float, typer.Option("--start", help="First second of the video to take.", metavar="S")] = 0.0,
+    end: Annotated[float, typer.Option("--end", help="Last second of the video to take.", metavar="S")] = math.inf,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Images a second at most; without, all.", metavar="N")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the recording that --out names.")] = False,
 ) -> None:
     """Make a recording of a video and its camera's calibration."""
     from pipeprog_bringup.console import share_bar
+    from pipeprog_bringup.footage.shot import Excerpt
+    from pipeprog_bringup.ingest import Request
     from pipeprog_bringup.ingest import ingest as run
 
+    request = Request(video, camera, out, Excerpt(start, end, fps), quality, force)
     with share_bar("ingest") as report:
-        ingested = run(video, camera, out, quality, force, report)
+        ingested = run(request, report)
     for note in ingested.notes:
         _note(note)
     _say(f"{ingested.frames} frames of {ingested.seconds:.1f} s: {out}")

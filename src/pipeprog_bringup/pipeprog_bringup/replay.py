@@ -112,11 +112,17 @@ def _read(request: Request) -> _Inputs:
     board_file = load_board_file(request.board) if request.board else BoardFile()
     if request.rate is not None and not request.rate > 0:
         raise InputError(f"--rate {request.rate:g}: give a factor above zero, 1 for real time")
-    if any(text.partition("=")[0].strip() == "frames.lockstep" for text in request.overrides):
+    if "frames.lockstep" in _names(request):
         raise InputError("--set frames.lockstep: a replay is always in lockstep, or it would lose frames")
-    configs = effective(request.overrides)
+    known = [] if "sfm.readout" in _names(request) or bag.readout is None else [f"sfm.readout={bag.readout!r}"]
+    configs = effective([*known, *request.overrides])
     configs["frames"] = dataclasses.replace(configs["frames"], lockstep=True)
     return _Inputs(bag, boq, board_file, configs)
+
+
+def _names(request: Request) -> set[str]:
+    """The settings that the user has given."""
+    return {text.partition("=")[0].strip() for text in request.overrides}
 
 
 def _parameters(request: Request, configs: dict[str, Any], colmap: Path) -> dict[str, dict[str, Any]]:

@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeprog_bringup.ingest import START, Ingested, ingest, read_camera
+from pipeprog_bringup.footage.camera_file import read_camera_file
+from pipeprog_bringup.footage.quicktime import Movie, read_movie
+from pipeprog_bringup.footage.shot import UNDATED, Excerpt
+from pipeprog_bringup.ingest import Ingested, Request, ingest
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.encoded_image import encoded_size
@@ -58,8 +61,11 @@ def frame_size(data: bytes) -> tuple[int, int]:
     return encoded_size(bytes(cdr.read_image(data, cdr.COMPRESSED_IMAGE).data))
 
 
-def run(folder: Path, source: Path, camera: Path, force: bool = False) -> Ingested:
-    return ingest(source, camera, folder / "bag.mcap", 95, force, lambda share, text: None)
+def run(
+    folder: Path, source: Path, camera: Path, force: bool = False, excerpt: Excerpt | None = None, out: str = "bag.mcap"
+) -> Ingested:
+    request = Request(source, camera, folder / out, excerpt or Excerpt(), 95, force)
+    return ingest(request, lambda share, text: None)
 
 
 def test_a_video_becomes_a_recording(tmp_path: Path) -> None:
@@ -68,7 +74,7 @@ def test_a_video_becomes_a_recording(tmp_path: Path) -> None:
     frames = list(bag)
     assert len(frames) == ingested.frames == FRAMES
     assert bag.camera.distortion == (0.1, -0.05, 0, 0, 0)
-    np.testing.assert_allclose([frame.stamp for frame in frames], START + 40_000_000 * np.arange(FRAMES), atol=1e5)
+    np.testing.assert_allclose([frame.stamp for frame in frames], UNDATED + 40_000_000 * np.arange(FRAMES), atol=1e5)
     assert ingested.notes == []
     assert frame_size(frames[0].data) == (160, 96)
 
@@ -109,7 +115,7 @@ def test_bad_videos_are_errors_and_leave_nothing(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=expected):
             run(tmp_path, tmp_path / name, camera)
     with pytest.raises(InputError, match=r"\.mcap"):
-        ingest(video(tmp_path / "v.mp4"), camera, tmp_path / "bag.bag", 95, False, lambda share, text: None)
+        run(tmp_path, video(tmp_path / "v.mp4"), camera, out="bag.bag")
     assert not (tmp_path / "bag.mcap").exists()
     assert not list(tmp_path.glob(".pipeprog*"))
 
@@ -132,7 +138,7 @@ def test_bad_videos_are_errors_and_leave_nothing(tmp_path: Path) -> None:
 def test_bad_calibrations_are_errors(tmp_path: Path, changes: dict[str, Any], expected: str) -> None:
     path = calibration(tmp_path / "c.yaml", **changes)
     with pytest.raises(InputError, match=expected) as caught:
-        read_camera(path)
+        read_camera_file(path)
     assert str(path) in str(caught.value)
 
 
@@ -143,7 +149,7 @@ def test_a_calibration_that_is_no_yaml(tmp_path: Path) -> None:
         ("absent.yaml", r"no such file: .*absent\.yaml"),
     ):
         with pytest.raises(InputError, match=expected):
-            read_camera(tmp_path / name)
+            read_camera_file(tmp_path / name)
 
 
 def lying_avi(path: Path, size: tuple[int, int] = (160, 96), rate: tuple[int, int] = (1, 25), frames: int = 12) -> Path:
@@ -201,9 +207,93 @@ def test_rates_that_are_none_give_stamps_that_rise(tmp_path: Path, rate: tuple[i
     stamps = [frame.stamp for frame in Bag.open(tmp_path / "bag.mcap")]
     assert stamps == sorted(set(stamps))
     assert ingested.frames == len(stamps) == FRAMES
-    assert stamps[-1] < START + 86_400 * 10**9
+    assert stamps[-1] < UNDATED + 86_400 * 10**9
 
 
 def test_frames_that_are_declared_and_not_there_are_told(tmp_path: Path) -> None:
     ingested = run(tmp_path, lying_avi(tmp_path / "v.avi", frames=10**6), calibration(tmp_path / "c.yaml"))
-    assert "12 of 1000000 frames" in ingested.notes[0]
+    assert any("12 of 1000000 frames" in note for note in ingested.notes)
+
+
+def dated(path: Path, seconds: int) -> Path:
+    """The video with a time at which it was created, as phones write it: from 1904 on (ISO 14496-12, 8.2.2)."""
+    content = bytearray(video(path).read_bytes())
+    at = content.index(b"mvhd") + 8
+    content[at : at + 4] = struct.pack(">I", seconds + 2_082_844_800)
+    path.write_bytes(content)
+    return path
+
+
+def test_stamps_begin_when_the_video_was_filmed(tmp_path: Path) -> None:
+    filmed = 1_772_445_600
+    run(tmp_path, dated(tmp_path / "v.mp4", filmed), calibration(tmp_path / "c.yaml"))
+    stamps = [frame.stamp for frame in Bag.open(tmp_path / "bag.mcap")]
+    assert stamps[0] == filmed * 10**9
+    assert abs(stamps[-1] - stamps[0] - (FRAMES - 1) * 40_000_000) < 1e5
+
+
+def test_an_excerpt_at_fewer_images_a_second(tmp_path: Path) -> None:
+    source, camera = video(tmp_path / "v.mp4"), calibration(tmp_path / "c.yaml")  # 12 frames, 0.04 s apart
+    for excerpt, numbers in (
+        (Excerpt(0.1, 0.3), (3, 4, 5, 6, 7)),
+        (Excerpt(rate=12.5), (0, 2, 4, 6, 8, 10)),
+        (Excerpt(rate=10), (0, 3, 5, 8, 10)),
+        (Excerpt(0.2, rate=100), (5, 6, 7, 8, 9, 10, 11)),
+    ):
+        ingested = run(tmp_path, source, camera, True, excerpt)
+        stamps = [frame.stamp for frame in Bag.open(tmp_path / "bag.mcap")]
+        np.testing.assert_allclose(stamps, UNDATED + 40_000_000 * np.array(numbers), atol=1e5)
+        assert ingested.notes == []
+    with pytest.raises(InputError, match="no frame between --start and --end"):
+        run(tmp_path, source, camera, True, Excerpt(5.0))
+
+
+@pytest.mark.parametrize("excerpt", [(-1.0, 2.0), (3.0, 2.0), (math.nan, 2.0), (0.0, 1.0, 0.0), (0.0, 1.0, math.inf)])
+def test_excerpts_that_are_none(excerpt: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match=r"--start|--fps"):
+        Excerpt(*excerpt)
+
+
+def test_motion_jpeg_is_kept_as_it_is(tmp_path: Path) -> None:
+    source = lying_avi(tmp_path / "v.avi")
+    ingested = run(tmp_path, source, calibration(tmp_path / "c.yaml"))
+    assert ingested.notes == ["12 frames were JPEG already and are kept as they were"]
+    content = source.read_bytes()
+    for frame in Bag.open(tmp_path / "bag.mcap"):
+        assert bytes(cdr.read_image(frame.data, cdr.COMPRESSED_IMAGE).data) in content
+
+
+def test_the_read_out_of_the_calibration_reaches_the_recording(tmp_path: Path) -> None:
+    source = video(tmp_path / "v.mp4")
+    run(tmp_path, source, calibration(tmp_path / "c.yaml", readout=0.015))
+    assert Bag.open(tmp_path / "bag.mcap").readout == 0.015
+    run(tmp_path, source, calibration(tmp_path / "c.yaml"), force=True)
+    assert Bag.open(tmp_path / "bag.mcap").readout is None
+    for readout in (-0.01, 1.0, math.nan, "fast"):
+        with pytest.raises(InputError, match=r"c.yaml.*(read-out|readout)"):
+            run(tmp_path, source, calibration(tmp_path / "c.yaml", readout=readout), force=True)
+
+
+def box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", 8 + len(content)) + kind + content
+
+
+def test_colours_that_jpeg_has_not_are_told(tmp_path: Path) -> None:
+    colours = box(b"colr", b"nclx" + struct.pack(">HHH", 9, 18, 9) + b"\0")
+    entry = box(b"hvc1", bytes(78) + colours + box(b"hvcC", bytes(17) + b"\xfa" + bytes(5)))
+    inner = box(b"stsd", bytes(8) + entry)
+    for kind in (b"stbl", b"minf", b"mdia", b"trak", b"moov"):
+        inner = box(kind, inner)
+    path = tmp_path / "v.mov"
+    path.write_bytes(box(b"ftyp", b"qt  ") + inner)
+    assert read_movie(path) == Movie(None, 10, "HLG")
+    whole = path.read_bytes()
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        assert read_movie(path).created is None
+
+
+def test_boxes_without_end_end(tmp_path: Path) -> None:
+    path = tmp_path / "v.mov"
+    path.write_bytes(struct.pack(">I", 8) + b"free" + (struct.pack(">I", 8) + b"moov") * 50_000)
+    assert read_movie(path) == Movie()

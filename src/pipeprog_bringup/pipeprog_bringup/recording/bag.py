@@ -24,6 +24,7 @@ from pipeprog_bringup.recording.video_stream import VideoStream, video_codec
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_TRIED_IMAGES
+from pipeprog_camera.rolling_shutter import check_readout
 
 _USED_TYPES = {*IMAGE_TYPES, cdr.CAMERA_INFO, cdr.ODOMETRY, cdr.IMU, cdr.TF}
 
@@ -129,6 +130,19 @@ class Bag:
             yield from video.finish()
 
     @property
+    def readout(self) -> float | None:
+        """The read-out of the camera [s] that `ingest` has noted; None where it is not told."""
+        facts = [file.facts for file in self._files if isinstance(file, McapFile)]
+        told = [fact[key] for fact in facts if (key := readout_key(self.image_topic)) in fact]
+        try:
+            readout = float(told[0]) if told else None
+            if readout is not None:
+                check_readout(readout)
+        except (ValueError, InputError) as error:
+            raise InputError(f"{self.path}: {error}: ingest the video again, or give --set sfm.readout=...") from None
+        return readout
+
+    @property
     def losses(self) -> list[str]:
         """The parts of the recording that cannot be read, one sentence each; complete once it was read to its end."""
         damaged = [f"{count} messages on {topic} left out: damaged" for topic, count in self._left_out.items() if count]
@@ -144,6 +158,11 @@ class Bag:
         tried = f"first {MAX_TRIED_IMAGES}" if faults.total() == MAX_TRIED_IMAGES else str(self.image_count)
         fault = faults.most_common(1)[0][0] if faults else "their chunks are damaged"
         raise InputError(f"{self.path}: none of the {tried} images on {self.image_topic} can be used: {fault}")
+
+
+def readout_key(image_topic: str) -> str:
+    """The key of a recording's metadata record `pipeprog` that has the read-out of a camera."""
+    return f"readout_{image_topic}"
 
 
 def _opened(path: Path) -> MessageFile:

@@ -70,6 +70,11 @@ class McapFile:
         return file
 
     @property
+    def facts(self) -> dict[str, str]:
+        """What `BagWriter.describe` has noted."""
+        return self._walk.facts
+
+    @property
     def message_count(self) -> int:
         """Messages of all channels that can be read."""
         return sum(self.counts.values())

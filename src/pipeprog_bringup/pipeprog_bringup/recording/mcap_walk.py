@@ -58,6 +58,7 @@ class Walk:
         self.blocks: list[Block] = []
         self.torn_at: int | None = None
         self.damaged: dict[int, str] = {}
+        self.facts: dict[str, str] = {}  # of the metadata records named pipeprog
         self._schemas: dict[int, str] = {}
 
     def follow(self, stream: BinaryIO, claimed: Allowance) -> None:
@@ -92,6 +93,8 @@ class Walk:
                     self._describe(stream, opcode, position, length)
                 else:
                     summary.append((opcode, position, length))
+            elif opcode == Opcode.METADATA and data_section and length <= MAX_DESCRIPTION:
+                self._note_facts(stream.read(length))
             elif data_section:
                 self._add_messages(stream, opcode, position, length, claimed)
             data_section = data_section and opcode != Opcode.DATA_END
@@ -145,6 +148,12 @@ class Walk:
                 "use one of zstd, lz4, none"
             )
         self.blocks.append(Block(offset, start, end - offset, compression, uncompressed_size, crc, whole))
+
+    def _note_facts(self, data: bytes) -> None:
+        with contextlib.suppress(McapError, struct.error, UnicodeDecodeError):
+            record = records.Metadata.read(ReadDataStream(io.BytesIO(data)))
+            if record.name == "pipeprog":
+                self.facts |= record.metadata
 
     def _describe(self, stream: BinaryIO, opcode: int, position: int, length: int) -> None:
         """Note the schema or channel of the record at `position`."""

@@ -65,7 +65,7 @@ class Ros1File:
                 raise InputError(f"{path} is a ROS 1 bag of another format than 2.0: run `rosbag fix` on it")
             walk = _Walk(path, size)
             walk.follow(stream)
-        rows = np.array(walk.rows, np.int64).reshape(-1, 4)
+        rows: NDArray[np.int64] = np.array(walk.rows, np.int64).reshape(-1, 4)
         rows = rows[np.isin(rows[:, 3], list(walk.channels))]
         rows = rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
         counts = Counter(rows[:, 3].tolist())
