@@ -36,6 +36,7 @@ class WorkerProcess:
         on_death: Callable[[int], None],
     ) -> None:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for the child: on small matrices BLAS threads only spin
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Numba's threads: what waits must leave the core to others
         context = multiprocessing.get_context("spawn")  # fork would copy the middleware's threads half alive
         self._connection, child = context.Pipe()
         self._process = context.Process(target=_child_main, args=(child, serve, arguments), daemon=True)

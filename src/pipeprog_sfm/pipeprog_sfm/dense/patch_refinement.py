@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 RADIUS = 2  # of a patch [px]: 5 x 5, smaller than the thinnest pipe at working distance
 SIZE = (2 * RADIUS + 1) ** 2
+COLUMNS = np.tile(np.arange(-RADIUS, RADIUS + 1, dtype=np.float32), 2 * RADIUS + 1)  # of a patch's pixels
+ROWS = np.repeat(np.arange(-RADIUS, RADIUS + 1, dtype=np.float32), 2 * RADIUS + 1)
 PLANE_RADIUS = 2  # grid pixels around one whose inverse depths give its slant
 SAME_SURFACE = 0.01  # relative difference of depth up to which neighbouring pixels lie on one surface
 CORRELATION_MIN = 0.3  # below, a view does not see the patch
@@ -28,7 +30,7 @@ ROUNDS = (1, 2, 0)  # distance in grid pixels at which each round takes over pla
 def refine(
     inverse_depth: NDArray[np.float32],
     image: NDArray[np.float32],
-    neighbours: NDArray[np.float32],
+    neighbours: NDArray[np.uint8],
     homographies: NDArray[np.float64],
     epipoles: NDArray[np.float64],
     stride: int,
@@ -41,14 +43,26 @@ def refine(
     """
     homographies, epipoles = homographies.astype(np.float32), epipoles.astype(np.float32)
     better_half = (len(neighbours) + 1) // 2
+    fours = np.stack([_fours(neighbour) for neighbour in neighbours])
     correlation = np.zeros_like(inverse_depth)
     sigma = np.full_like(inverse_depth, FLATNESS)
     for distance in ROUNDS:
         inverse_depth, slant = _smooth(inverse_depth, sigma, stride)
         inverse_depth, correlation, sigma = _round(
-            inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride
+            inverse_depth, slant, image, fours, homographies, epipoles, better_half, distance, stride
         )
     return _smooth(inverse_depth, sigma, stride)[0], correlation, sigma
+
+
+def _fours(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """(h, w) of an image: a pixel with those right of it, below and below right, from the lowest byte on.
+
+    One load then gives what a place between pixels is interpolated from.
+    """
+    wide = image.astype(np.uint32)
+    wide[:, :-1] |= wide[:, 1:] << np.uint32(8)
+    wide[:-1] |= wide[1:] << np.uint32(16)
+    return wide
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -109,8 +123,6 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
         if v < RADIUS or v >= image.shape[0] - RADIUS:
             continue
         patch = np.empty(SIZE, np.float32)
-        warped = np.empty(SIZE, np.float32)
-        change = np.empty(SIZE, np.float32)
         scores = np.empty(len(neighbours), np.float32)
         for column in range(width):
             u = column * stride
@@ -144,8 +156,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
                 if candidate > 0 and abs(depth - best_depth) < np.float32(SAME_PLANE) * depth:
                     continue
                 score, step, sigma = _match(
-                    patch, energy, neighbours, homographies, epipoles,
-                    u, v, depth, su, sv, better_half, warped, change, scores,
+                    patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores,
                 )  # fmt: skip
                 if score > best:
                     best_depth, best, best_step, best_sigma = depth, score, step, sigma
@@ -158,13 +169,18 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
-def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, warped, change, scores):  # type: ignore[no-untyped-def]
-    """Mean correlation over the better half of the views, Gauss-Newton step of the inverse depth, sigma (0: unseen)."""
-    one = np.float32(1.0)
+def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores):  # type: ignore[no-untyped-def]
+    """Mean correlation over the better half of the views, Gauss-Newton step of the inverse depth, sigma (0: unseen).
+
+    `patch` (SIZE,) is the reference's patch less its mean, `energy` the sum of its squares; `neighbours` (N, h, w)
+    hold four pixels each (`_fours`).
+    """
+    one, size = np.float32(1.0), np.float32(SIZE)
     gradient, curvature, residual, used = np.float32(0.0), np.float32(0.0), np.float32(0.0), 0
+    height, width = neighbours.shape[1:]
+    pixels = neighbours.reshape(len(neighbours), height * width)
     for n in range(len(neighbours)):
         scores[n] = -1.0
-        image = neighbours[n]
         h, e = homographies[n], epipoles[n]
         z = one / (h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * depth)
         x = (h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * depth) * z
@@ -176,34 +192,13 @@ def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, s
         dx, dy = (e[0] - e[2] * x) * z, (e[1] - e[2] * y) * z
         reach_x, reach_y = RADIUS * (abs(xu) + abs(xv)), RADIUS * (abs(yu) + abs(yv))
         inside = x - reach_x >= 0.0 and y - reach_y >= 0.0
-        if not (inside and x + reach_x < image.shape[1] - 1 and y + reach_y < image.shape[0] - 1):
+        if not (inside and x + reach_x < width - 1 and y + reach_y < height - 1):
             continue
-        k = 0
-        mean, mean_change = np.float32(0.0), np.float32(0.0)
-        for i in range(-RADIUS, RADIUS + 1):
-            for j in range(-RADIUS, RADIUS + 1):
-                px, py = x + xu * j + xv * i, y + yu * j + yv * i
-                ix, iy = np.int32(px), np.int32(py)
-                fx, fy = px - np.float32(ix), py - np.float32(iy)
-                top_left, bottom_left = image[iy, ix], image[iy + 1, ix]
-                top_slope, bottom_slope = image[iy, ix + 1] - top_left, image[iy + 1, ix + 1] - bottom_left
-                top = top_left + top_slope * fx
-                fall = bottom_left + bottom_slope * fx - top
-                warped[k] = top + fall * fy
-                change[k] = (top_slope + (bottom_slope - top_slope) * fy) * dx + fall * dy
-                mean += warped[k]
-                mean_change += change[k]
-                k += 1
-        mean /= SIZE
-        mean_change /= SIZE
-        ww, wp, cc, cp, cw = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for k in range(SIZE):
-            w, c, p = warped[k] - mean, change[k] - mean_change, patch[k]
-            ww += w * w
-            wp += w * p
-            cc += c * c
-            cp += c * p
-            cw += c * w
+        across, down = (x, xu, xv, dx), (y, yu, yv, dy)
+        sw, sc, ww, wp, cc, cp, cw = _moments(patch, pixels[n], np.int32(width), across, down)
+        ww = max(ww - sw * sw / size, np.float32(0.0))
+        cc -= sc * sc / size
+        cw -= sc * sw / size
         correlation = wp / np.sqrt(ww * energy + np.float32(1e-6))
         scores[n] = correlation
         if correlation < CORRELATION_MIN:
@@ -218,6 +213,45 @@ def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, s
         return np.float32(-1.0), np.float32(0.0), np.float32(0.0)
     variance = max(residual, np.float32(0.0)) / np.float32(used * SIZE) + np.float32(NOISE * NOISE)
     return total / np.float32(better_half), gradient / curvature, np.sqrt(variance / curvature)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+def _moments(patch, pixels, width, across, down):  # type: ignore[no-untyped-def]
+    """Sums over a patch (SIZE,) of w, c, ww, wp, cc, cp, cw: w the warped view, c its change with the inverse depth.
+
+    The loop stores nothing, so that the compiler makes vector code of it. w is taken less the pixel at the centre: the
+    sums stay so small that their differences are exact enough in float32. `pixels` (h * w,) hold four pixels each.
+    `across`, `down`: column and row of the patch's centre in the view, and their derivatives by the patch's column and
+    row and by the inverse depth.
+    """
+    x, xu, xv, dx = across
+    y, yu, yv, dy = down
+    level = np.float32(np.int32(pixels[np.uint32(np.int32(np.int32(y) * width) + np.int32(x))] & np.uint32(255)))
+    sw, sc, ww, wp = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    cc, cp, cw = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(SIZE):
+        j, i = COLUMNS[k], ROWS[k]
+        px, py = x + xu * j + xv * i, y + yu * j + yv * i
+        ix, iy = np.int32(px), np.int32(py)
+        fx, fy = px - np.float32(ix), py - np.float32(iy)
+        four = pixels[np.uint32(np.int32(iy * width) + ix)]
+        top_left = np.float32(np.int32(four & np.uint32(255)))
+        top_slope = np.float32(np.int32(np.uint32(four >> np.uint32(8)) & np.uint32(255))) - top_left
+        bottom_left = np.float32(np.int32(np.uint32(four >> np.uint32(16)) & np.uint32(255)))
+        bottom_slope = np.float32(np.int32(np.uint32(four >> np.uint32(24)))) - bottom_left
+        top = top_left + top_slope * fx
+        fall = bottom_left + bottom_slope * fx - top
+        w = top + fall * fy - level
+        c = (top_slope + (bottom_slope - top_slope) * fy) * dx + fall * dy
+        p = patch[k]
+        sw += w
+        sc += c
+        ww += w * w
+        wp += w * p
+        cc += c * c
+        cp += c * p
+        cw += c * w
+    return sw, sc, ww, wp, cc, cp, cw
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")

@@ -115,14 +115,14 @@ def depth_map(
     others, homographies, epipoles = [], [], []
     for neighbour in neighbours:
         other, other_camera = working_image(neighbour.image, neighbour.camera, config.width)
-        others.append(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY).astype(np.float32))
+        others.append(np.asarray(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY), np.uint8))
         other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
         homographies.append(other_camera.matrix @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
         epipoles.append(other_camera.matrix @ other_from_reference[:3, 3])
     homography, epipole = np.stack(homographies), np.stack(epipoles)
     inverse = sweep(
         cv2.pyrDown(_without_shading(gray)),
-        np.stack([_low_pass(_without_shading(other)) for other in others]),
+        np.stack([_low_pass(_without_shading(other.astype(np.float32))) for other in others]),
         homography @ np.diag([STRIDE, STRIDE, 1.0]),
         epipole,
         (1.0 / far, 1.0 / near),
