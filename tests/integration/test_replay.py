@@ -211,6 +211,7 @@ def test_an_interrupt_ends_all_and_writes_nothing(tmp_path: Path, number: signal
     _, errors = process.communicate(timeout=PLAYING / 2)
     assert process.returncode == code
     assert "Traceback" not in errors
+    assert ("Interrupted: nothing was written." in errors) == (number == signal.SIGINT)
     assert not (tmp_path / "out").exists()
     assert not any(is_running(pid) for pid in nodes.values())
 

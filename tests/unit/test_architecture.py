@@ -65,6 +65,10 @@ FOLDERS = {
         "view": {"report", "results"},
         "fleet": {"report", "results"},
         "playback": {"recording", "results"},
+        "commands": {  # as thin as they are, they stand above all
+            *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
+            *("console", "footage", "plane_from_keyframe"),
+        },
     },
 }
 LICENCE = "# SPDX-License-Identifier: Apache-2.0"

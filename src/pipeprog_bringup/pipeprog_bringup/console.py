@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from pipeprog_bringup.playback.session import State
     from pipeprog_detect.product.product import Product
 
+_LINE_SECONDS = 10.0  # between two lines of progress in a file: few for a survey of minutes, soon enough to be seen
+
 
 def output_console() -> Console:
     """The console for tables: as wide as the terminal, 120 columns where stdout is a file or a pipe."""
@@ -41,8 +43,15 @@ def progress_display() -> Progress:
 
 
 @contextlib.contextmanager
-def share_bar(name: str) -> Iterator[Callable[[float, str], None]]:
-    """One bar, moved by calls with the share done (0..1) and what is being done."""
+def share_bar(name: str, quiet: bool = False) -> Iterator[Callable[[float, str], None]]:
+    """One bar, moved by calls with the share done (0..1) and what is being done; lines where stderr is no terminal."""
+    if quiet:
+        yield lambda share, stage: None
+        return
+    if not sys.stderr.isatty():
+        lines = _Lines()
+        yield lambda share, stage: lines.tell(name, f"{name}: {100 * share:.0f} %, {stage}")
+        return
     with progress_display() as display:
         task = display.add_task(name, total=1.0, detail="")
 
@@ -53,8 +62,22 @@ def share_bar(name: str) -> Iterator[Callable[[float, str], None]]:
 
 
 @contextlib.contextmanager
-def replay_bars() -> Iterator[Callable[[State], None]]:
-    """Three bars, moved by the states of a replay: frames considered, keyframes registered, stage."""
+def replay_bars(quiet: bool = False) -> Iterator[Callable[[State], None]]:
+    """Three bars, moved by the states of a replay: frames considered, keyframes registered, stage.
+
+    Lines in place of bars where stderr is no terminal.
+    """
+    if quiet:
+        yield lambda state: None
+        return
+    if not sys.stderr.isatty():
+        lines = _Lines()
+        yield lambda state: lines.tell(
+            state.stage,
+            f"replay: {state.stage}, {state.considered} of {state.frames} frames considered, "
+            f"{state.registered} of {state.keyframes} keyframes registered",
+        )
+        return
     with progress_display() as display:
         frames = display.add_task("frames considered", total=None, detail="")
         keyframes = display.add_task("keyframes registered", total=None, detail="")
@@ -68,6 +91,20 @@ def replay_bars() -> Iterator[Callable[[State], None]]:
             display.update(stage, description=state.stage)
 
         yield report
+
+
+class _Lines:
+    """Progress as lines on stderr, for a file or a pipe: one for each stage, and one now and then within it."""
+
+    def __init__(self) -> None:
+        self._stage, self._told = "", 0.0
+
+    def tell(self, stage: str, line: str) -> None:
+        """Print a line if it is of a new stage, or the last is some seconds old."""
+        now = time.monotonic()
+        if stage != self._stage or now > self._told + _LINE_SECONDS:
+            self._stage, self._told = stage, now
+            print(for_terminal(line), file=sys.stderr, flush=True)
 
 
 class FleetDisplay:

@@ -11,6 +11,7 @@ from pathlib import Path
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import read_cloud
+from pipeprog_bringup.results.nothing_found import why_nothing_was_found
 from pipeprog_bringup.results.plan_file import write_plan
 from pipeprog_bringup.results.setting_overrides import effective
 from pipeprog_detect.config import DetectConfig
@@ -29,6 +30,7 @@ class Detection:
     product: Product
     points: int
     dropped: int
+    notes: list[str]  # sentences for the user
 
 
 def detect_file(
@@ -49,7 +51,11 @@ def detect_file(
         read = time.time()
         pipes = detect(file.cloud, boq, config, (), report)
         timings = {"read": read - started, "detect": time.time() - read}
-        detection = Detection(product_of(pipes, boq, 0.0), len(file.cloud.points), file.dropped)
+        product = product_of(pipes, boq, 0.0)
+        notes = why_nothing_was_found(product, file.cloud.points, boq)
+        if file.dropped:
+            notes.append(f"{file.dropped} points of {cloud_path} are not finite or beyond 1e8 m and were left out")
+        detection = Detection(product, len(file.cloud.points), file.dropped, notes)
         _write(folder, detection, cloud_path, boq, config, timings)
     return detection
 
@@ -74,6 +80,7 @@ def _write(
         "cloud": str(cloud_path.resolve()),
         "points": detection.points,
         "points_dropped": detection.dropped,
+        "notes": detection.notes,
         "seeds": {"detect": config.seed},
         "timings_s": timings,
     }

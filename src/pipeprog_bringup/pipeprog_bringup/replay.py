@@ -22,11 +22,13 @@ from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.nothing_found import why_nothing_was_found
 from pipeprog_bringup.results.plan_file import write_plan
 from pipeprog_bringup.results.setting_overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.product import Product
+from pipeprog_node.messages import points_from_cloud
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
 
@@ -45,6 +47,7 @@ class Request:
     camera_info_topic: str | None = None
     odometry_topic: str | None = None
     imu_topic: str | None = None
+    with_cloud: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,12 +90,18 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             record_survey(recording, survey, status)
             record_keyframes(recording, inputs.bag, session.log, survey.poses)
         started = time.monotonic()
+        product = write_survey(folder, survey, session.log, request.with_cloud)
+        points = points_from_cloud(survey.cloud)[0]
         outcome = Outcome(
-            product=write_survey(folder, survey, session.log),
+            product=product,
             frames=session.log.considered,
             keyframes=session.log.chosen,
             registered=status.keyframes_registered,
-            notes=inputs.bag.notes,
+            notes=[
+                *inputs.bag.notes,
+                *filter(None, [status.message]),
+                *why_nothing_was_found(product, points, inputs.boq),
+            ],
             losses=inputs.bag.losses + session.log.faults(),
         )
         if inputs.boq.pipes:

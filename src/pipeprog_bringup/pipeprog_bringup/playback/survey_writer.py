@@ -29,16 +29,17 @@ from pipeprog_node import messages
 _SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}
 
 
-def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog) -> Product:
-    """Write pipes.json, progress.csv, cloud.ply, cloud.las, trajectory.tum, frames.csv; returns the product."""
+def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog, with_cloud: bool) -> Product:
+    """Write pipes.json, progress.csv, trajectory.tum, frames.csv, cloud.ply and .las if wanted; returns the product."""
     product = product_from_msg(survey.pipes)
     scale = result_files.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
     result_files.write_pipes(folder.file("pipes.json"), product, scale)
     result_files.write_progress(folder.file("progress.csv"), product)
-    points, normals = messages.points_from_cloud(survey.cloud)
-    colors = messages.colors_from_cloud(survey.cloud)
-    write_ply(folder.file("cloud.ply"), points, colors, normals)
-    write_las(folder.file("cloud.las"), points, colors, normals)
+    if with_cloud:
+        points, normals = messages.points_from_cloud(survey.cloud)
+        colors = messages.colors_from_cloud(survey.cloud)
+        write_ply(folder.file("cloud.ply"), points, colors, normals)
+        write_las(folder.file("cloud.las"), points, colors, normals)
     poses = [pose.pose for pose in survey.poses.poses]
     result_files.write_trajectory(
         folder.file("trajectory.tum"),

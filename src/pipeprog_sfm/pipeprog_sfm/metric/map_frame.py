@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,23 +29,41 @@ class Vertical:
     source: str
 
 
-def board_vertical(place: PlacedBoard, poses: Mapping[int, FloatArray]) -> tuple[Vertical, str]:
+def board_vertical(
+    place: PlacedBoard, poses: Mapping[int, FloatArray], others: Iterable[Vertical] = ()
+) -> tuple[Vertical, str]:
     """The y axis of a board that hangs plumb, and a warning or an empty text.
 
-    Where the board looks the same upside down, the direction that is up in the images counts.
+    Where the board looks the same upside down, the direction that is up in the images counts; where the camera was held
+    nearer to lying than to upright, the first of the `others`, which are asked for only then.
     """
     up = camera_up({view.stamp: poses[view.stamp] for view in place.views})
+    is_lying, is_symmetric = _is_steep(_axes(place), up), len(symmetries(place.board)) > 1
+    known = next(iter(others), None) if is_lying and is_symmetric else None
+    if known is not None:
+        up = known.up_in_model
     place = _turned_up(place, up)
     axes = _axes(place)
     along = axes.T @ up
     text = ""
-    if along[1] < abs(along[0]):
+    if is_lying and is_symmetric and known is None:
+        text = (
+            f"which side of board {place.board.name} is up is not certain, and z of the map may point down: the board "
+            "looks the same upside down, and the camera was held sideways, or the board hangs so: film upright, record "
+            "an IMU or odometry, or hang a board that has no symmetry"
+        )
+    elif along[1] < abs(along[0]):
         tilt = abs(np.rad2deg(np.arctan2(along[0], along[1])))
         text = (
             f"board {place.board.name} hangs {tilt:.0f} degrees off upright as the camera was held, and the map's z "
             "axis with it: hang it upright, or set upright to false"
         )
     return Vertical(axes[:, 1], f"board {place.board.name}"), text
+
+
+def _is_steep(axes: FloatArray, up: FloatArray) -> bool:
+    """Whether a board's x axis is nearer to the vertical than its y axis, on either side."""
+    return bool(abs(axes[:, 1] @ up) < abs(axes[:, 0] @ up))
 
 
 def path_vertical(path: CameraPath, poses: Mapping[int, FloatArray]) -> Vertical:

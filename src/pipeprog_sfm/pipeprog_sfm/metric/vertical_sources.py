@@ -43,10 +43,14 @@ def imu(posed: PosedEvidence, scale: float) -> list[Vertical | ScaleWarning]:
 
 
 def plumb_board(posed: PosedEvidence, scale: float) -> list[Vertical | ScaleWarning]:
-    """The y axis of the board that was seen first, where boards hang upright."""
+    """The y axis of the board that was seen first, where boards hang upright.
+
+    Should neither board nor images tell which end of it is up, IMU or odometry do.
+    """
     if not posed.boards.sound or not posed.board_config.upright:
         return []
-    vertical, warning = board_vertical(posed.boards.sound[0], posed.poses)
+    others = (one for source in (imu, odometry_frame) for one in source(posed, scale) if isinstance(one, Vertical))
+    vertical, warning = board_vertical(posed.boards.sound[0], posed.poses, others)
     return [vertical, *([ScaleWarning(warning)] if warning else [])]
 
 

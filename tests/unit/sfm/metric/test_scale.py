@@ -15,6 +15,7 @@ from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile, KnownDistance
 from pipeprog_sfm.boards.placed_board import PosedCamera
 from pipeprog_sfm.config import BoardConfig
+from pipeprog_sfm.metric.map_frame import Vertical, board_vertical
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import Measurement, NoScaleError, ScaleWarning
@@ -105,6 +106,18 @@ def test_a_board_upside_down_in_all_images_is_turned_up():
     walk = Walk(2, roll=np.pi)
     z_of_board_up = (told(walk).map_from_model @ walk.model_from_board)[2, 1]
     assert z_of_board_up == pytest.approx(-1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("roll", [0.5 * np.pi, -0.5 * np.pi])
+def test_a_board_filmed_sideways_is_up_by_another_source_or_said_to_be_uncertain(roll):
+    walk = Walk(2, roll=roll)
+    (place,) = told(walk).boards
+    assert any("which side of board A is up is not certain" in text for text in told(walk).warnings)
+    up = walk.model_from_board[:3, 1] / walk.factor
+    for truth in (up, -up):
+        found, warning = board_vertical(place, walk.poses, iter([Vertical(truth, "IMU")]))
+        assert found.up_in_model == pytest.approx(truth, abs=1e-6)
+        assert not warning
 
 
 def test_a_lopsided_board_upside_down_is_warned_about():
