@@ -34,6 +34,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from pipeprog_bringup.export.control_points import load_control_points
 from pipeprog_bringup.footage.camera_file import read_camera_file
+from pipeprog_bringup.footage.shot import Excerpt
+from pipeprog_bringup.ingest import Request, ingest
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.frame_check import image_size
@@ -48,6 +50,7 @@ from pipeprog_sfm.boards.board_file import load_board_file
 from tests.fuzz.attempts import Target
 from tests.fuzz.fuzzed_messages import IMAGES, fuzzed_message, good_messages
 from tests.fuzz.mutated_bytes import mutated
+from tests.unit.bringup.footage import scans
 from tests.unit.bringup.recordings import (
     START,
     camera_messages,
@@ -128,6 +131,9 @@ def targets() -> dict[str, Target]:
         Target("bag", ".mcap", partial(_damaged, _bags), _read_bag),
         Target("sqlite", ".db3", partial(_damaged, _databases), _read_bag),
         Target("ros1", ".bag", partial(_damaged, _ros1_bags), _read_bag),
+        Target("record3d", ".r3d", partial(_damaged, _archives), _ingest),
+        Target("stray_odometry", ".csv", partial(_spoiled_text, _stray_tables), _ingest_stray),
+        Target("polycam_camera", ".json", partial(_spoiled_text, _polycam_cameras), _ingest_polycam),
         Target("boq", ".yaml", partial(_spoiled_text, _boqs), load_boq),
         Target("boq_csv", ".csv", partial(_spoiled_text, _bill_tables), load_boq),
         Target("boq_xlsx", ".xlsx", partial(_damaged, _workbooks), load_boq),
@@ -246,6 +252,25 @@ def _workbooks() -> list[bytes]:
 @cache
 def _databases() -> list[bytes]:
     return [sqlite_bytes(camera_messages(3)), sqlite_bytes(camera_messages(1))]
+
+
+@cache
+def _archives() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        return [scans.record3d(Path(folder, "scan.r3d")).read_bytes()]
+
+
+@cache
+def _stray_tables() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        return [Path(scans.stray(Path(folder, "scan")), "odometry.csv").read_bytes()]
+
+
+@cache
+def _polycam_cameras() -> list[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        cameras = scans.polycam(Path(folder, "scan")) / "keyframes" / "corrected_cameras"
+        return [sorted(cameras.iterdir())[0].read_bytes()]
 
 
 @cache
@@ -408,6 +433,26 @@ def _read_bag(path: Path) -> None:
     for message in bag.with_motion():
         del message
     bag.losses  # noqa: B018 - a property that walks
+
+
+def _ingest(path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        ingest(Request(path, None, Path(folder, "bag.mcap"), Excerpt()), lambda share, text: None)
+
+
+def _ingest_stray(path: Path) -> None:
+    """An odometry.csv in a scan that is right."""
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copy(path, scans.stray(Path(folder, "scan")) / "odometry.csv")
+        _ingest(Path(folder, "scan"))
+
+
+def _ingest_polycam(path: Path) -> None:
+    """One camera's file in a scan that is right."""
+    with tempfile.TemporaryDirectory() as folder:
+        cameras = scans.polycam(Path(folder, "scan")) / "keyframes" / "corrected_cameras"
+        shutil.copy(path, sorted(cameras.iterdir())[0])
+        _ingest(Path(folder, "scan"))
 
 
 def _read_folder(path: Path) -> None:

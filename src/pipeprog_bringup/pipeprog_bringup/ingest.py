@@ -8,9 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
-from pipeprog_bringup.footage.camera_file import read_camera_file
-from pipeprog_bringup.footage.shot import Excerpt, Shot
+from pipeprog_bringup.footage.camera_file import CameraFile, read_camera_file
+from pipeprog_bringup.footage.polycam import Polycam
+from pipeprog_bringup.footage.record3d import Record3D
+from pipeprog_bringup.footage.shot import Excerpt, Footage, Shot
+from pipeprog_bringup.footage.stray_scanner import StrayScanner
 from pipeprog_bringup.footage.video import Video
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import readout_key
@@ -24,10 +29,10 @@ IMAGE_TOPIC, INFO_TOPIC = "/camera/image/compressed", "/camera/camera_info"
 
 @dataclass(frozen=True)
 class Request:
-    """What to ingest: a video with its calibration; JPEG `quality` of pictures that are decoded."""
+    """What to ingest: a video with its calibration, or an app's recording; JPEG `quality` of decoded pictures."""
 
     source: Path
-    camera: Path
+    camera: Path | None
     out: Path
     excerpt: Excerpt
     quality: int = 95
@@ -49,14 +54,14 @@ def ingest(request: Request, report: Callable[[float, str], None]) -> Ingested:
     Stamps are the source's own times, so a variable frame rate is kept. Raises InputError where source and calibration
     cannot be read or do not belong together.
     """
-    calibration = read_camera_file(request.camera)
+    calibration = read_camera_file(request.camera) if request.camera else None
     if request.out.suffix != ".mcap":
         raise InputError(f"--out {request.out}: a recording is an .mcap file")
-    footage = Video(request.source, calibration.camera, request.camera)
+    footage = _footage(request, calibration)
     stamps: list[int] = []
     encoded = 0
     with output_file(request.out, request.force) as temporary, temporary.open("wb") as stream, BagWriter(stream) as bag:
-        if calibration.readout is not None:
+        if calibration and calibration.readout is not None:
             bag.describe({readout_key(IMAGE_TOPIC): repr(calibration.readout)})
         for shot in footage.shots(request.excerpt):
             encoded += not isinstance(shot.picture, bytes)
@@ -70,11 +75,51 @@ def ingest(request: Request, report: Callable[[float, str], None]) -> Ingested:
     return Ingested(len(stamps), 1e-9 * (stamps[-1] - stamps[0]), [*footage.notes, *notes])
 
 
+def _footage(request: Request, calibration: CameraFile | None) -> Footage:
+    """The source by its form; raises InputError where it is none, or a video without its calibration."""
+    source = request.source
+    app: Footage | None = None
+    if (source / "odometry.csv").is_file():
+        app = StrayScanner(source)
+    elif (source / "keyframes").is_dir():
+        app = Polycam(source)
+    elif source.suffix == ".r3d" and source.is_file():
+        app = Record3D(source)
+    if app:
+        return app
+    if source.exists() and not source.is_file():
+        raise InputError(
+            f"{source} is a folder, a device or a pipe, and no scan of Stray Scanner or Polycam (raw data): "
+            "give such a folder, or a video file"
+        )
+    if request.camera is None or calibration is None:
+        raise InputError(f"{source}: a video needs the calibration of its camera: give --camera CAMERA.yaml")
+    return Video(source, calibration.camera, request.camera)
+
+
 def _write(bag: BagWriter, shot: Shot, quality: int) -> None:
-    """One picture and its calibration."""
-    picture = shot.picture
+    """One picture, its calibration, and what was measured beside it."""
+    picture, stamp = shot.picture, shot.stamp
     if not isinstance(picture, bytes):
         picture = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-    bag.write(INFO_TOPIC, cdr.CAMERA_INFO, cdr.write_camera_info(shot.stamp, FRAME_ID, shot.camera), shot.stamp)
-    image = cdr.write_compressed_image(shot.stamp, FRAME_ID, "jpeg", picture)
-    bag.write(IMAGE_TOPIC, cdr.COMPRESSED_IMAGE, image, shot.stamp)
+    if shot.world_from_camera is not None:
+        odometry = cdr.write_odometry(stamp, "odom", FRAME_ID, shot.world_from_camera)
+        bag.write("/odometry", cdr.ODOMETRY, odometry, stamp)
+    bag.write(INFO_TOPIC, cdr.CAMERA_INFO, cdr.write_camera_info(stamp, FRAME_ID, shot.camera), stamp)
+    image = cdr.write_compressed_image(stamp, FRAME_ID, "jpeg", picture)
+    bag.write(IMAGE_TOPIC, cdr.COMPRESSED_IMAGE, image, stamp)
+    if shot.depth is not None:
+        _write_depth(bag, shot, shot.depth)
+
+
+def _write_depth(bag: BagWriter, shot: Shot, depth: NDArray[np.uint16]) -> None:
+    """Depth [mm] with the camera at its size, and confidence, of 16 bits too: readers take 8 bits for pictures."""
+    camera = shot.camera.scaled(depth.shape[1] / shot.camera.width)
+    if (camera.height, camera.width) != depth.shape:
+        return
+    info = cdr.write_camera_info(shot.stamp, FRAME_ID, camera)
+    bag.write("/camera/depth/camera_info", cdr.CAMERA_INFO, info, shot.stamp)
+    for topic, values in (("/camera/depth/image", depth), ("/camera/depth/confidence", shot.confidence)):
+        if values is not None:
+            image = cdr.write_image(shot.stamp, FRAME_ID, "16UC1", values.astype(np.uint16))
+            bag.write(topic, cdr.IMAGE, image, shot.stamp)

@@ -24,7 +24,7 @@ def read_text(path: str | Path, most: int) -> str:
 
     Raises InputError, naming the file and the remedy, for what is no such file; a device or pipe is never opened.
     """
-    data = _read(path, most)
+    data = read_bytes(path, most)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -48,7 +48,8 @@ def require_regular(path: str | Path) -> None:
         raise InputError(f"{path} is {_KINDS.get(stat.S_IFMT(mode), 'something else')}: give a regular file")
 
 
-def _read(path: str | Path, most: int) -> bytes:
+def read_bytes(path: str | Path, most: int) -> bytes:
+    """The bytes of a regular file; raises InputError where it is none or has more than `most`."""
     require_regular(path)
     try:
         # Should a pipe take the file's place in this moment, opening it does not wait for a writer.

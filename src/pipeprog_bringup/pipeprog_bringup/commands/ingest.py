@@ -14,18 +14,24 @@ from pipeprog_bringup.commands.speech import note, say
 
 
 def ingest(
-    video: Annotated[Path, typer.Argument(help="Video: mp4, mov, ... Example: `walk.mp4`", metavar="VIDEO")],
-    camera: Annotated[
+    video: Annotated[
         Path,
-        typer.Option(
-            "--camera",
-            help="Calibration, as ROS camera_calibration writes it. Example: `--camera phone.yaml`",
-            metavar="CAMERA.yaml",
+        typer.Argument(
+            help="Video (mp4, mov, ...), folder of Stray Scanner or Polycam, or .r3d of Record3D. Example: `walk.mp4`",
+            metavar="VIDEO",
         ),
     ],
     out: Annotated[
         Path, typer.Option("--out", help="The recording to write. Example: `--out walk.mcap`", metavar="BAG.mcap")
     ],
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            "--camera",
+            help="Calibration of a video, as ROS camera_calibration writes it. Example: `--camera phone.yaml`",
+            metavar="CAMERA.yaml",
+        ),
+    ] = None,
     quality: Annotated[int, typer.Option(min=50, max=100, help="JPEG quality. Example: `--quality 90`")] = 95,
     start: Annotated[
         float, typer.Option("--start", help="First second of the video to take. Example: `--start 3`", metavar="S")
@@ -40,7 +46,7 @@ def ingest(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a recording of a video and its camera's calibration.
+    """Make a recording of a video and its camera's calibration, or of a scan.
 
     `pipeprog ingest walk.mp4 --camera CAMERA.yaml --out walk.mcap`
     """

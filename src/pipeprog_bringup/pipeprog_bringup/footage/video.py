@@ -93,6 +93,16 @@ class Video:
         return encoded or image
 
 
+def picture_size(path: Path) -> tuple[int, int]:
+    """(width, height) [px] of a video's pictures, as the sensor saw them; raises InputError where it is none."""
+    capture = _open(path)
+    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0.0)
+    size = int(_property(capture, cv2.CAP_PROP_FRAME_WIDTH)), int(_property(capture, cv2.CAP_PROP_FRAME_HEIGHT))
+    capture.release()
+    check_size(*size)
+    return size
+
+
 def _colour_notes(path: Path, movie: Movie) -> list[str]:
     """What becomes of colours that JPEG has not."""
     if not movie.transfer and movie.bits == 8:

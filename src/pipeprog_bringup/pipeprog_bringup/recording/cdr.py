@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 from mcap_ros2.writer import serialize_dynamic
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pipeprog_bringup.recording.definitions import message_definition
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera, check_whole_sensor
 from pipeprog_camera.limits import MAX_DISTORTION_COEFFICIENTS, MAX_NAME, MAX_SECONDS, MAX_SMALL_MESSAGE
 
@@ -193,6 +195,16 @@ def write_image(stamp: int, frame_id: str, encoding: str, pixels: NDArray[np.uin
     head += bytes(-len(head) % 4) + struct.pack("<II", height, width) + _text(encoding) + b"\0"  # is_bigendian
     head += bytes(-len(head) % 4) + struct.pack("<II", step, pixels.nbytes)
     return _LITTLE_ENDIAN + b"\0\0" + head + np.ascontiguousarray(pixels).tobytes()
+
+
+def write_odometry(stamp: int, frame_id: str, child: str, pose: FloatArray) -> bytes:
+    """CDR bytes of an Odometry with the (4, 4) pose of `child` in `frame_id`; velocities and covariances are zero."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    place = {
+        "position": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)),
+        "orientation": {"x": x, "y": y, "z": z, "w": w},
+    }
+    return write(ODOMETRY, {"header": header(stamp, frame_id), "child_frame_id": child, "pose": {"pose": place}})
 
 
 def _text(value: str) -> bytes:
