@@ -72,10 +72,15 @@ def write_bag(path: Path, frames: int = 23, damaged: int | None = None, motion: 
     return path
 
 
+BOARD = "boards: [{name: A, circle_radius_mm: 20, centres_mm: [[0, 0], [200, 0], [0, 150]]}]\n"
+
+
 def start(folder: Path, *options: str, fault: str = "", **recording: int) -> subprocess.Popen[str]:
     bag = write_bag(folder / "bag.mcap", **recording)
     (folder / "boq.yaml").write_text(BOQ)
-    arguments = ["replay", str(bag), "--boq", str(folder / "boq.yaml"), "--out", str(folder / "out"), *options]
+    (folder / "board.yaml").write_text(BOARD)
+    files = ["--boq", str(folder / "boq.yaml"), "--board", str(folder / "board.yaml")]
+    arguments = ["replay", str(bag), *files, "--out", str(folder / "out"), *options]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
     told = {"FAKE": fault, "FAKE_FOLDER": str(folder)}
     environment = {**os.environ, **told, "PYTHONPATH": path, "TMPDIR": str(folder)}

@@ -67,7 +67,7 @@ FOLDERS = {
         "playback": {"recording", "results"},
         "commands": {  # as thin as they are, they stand above all
             *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
-            *("console", "footage", "plane_from_keyframe"),
+            *("console", "footage", "plane_from_keyframe", "recording", "recording_check"),
         },
     },
 }

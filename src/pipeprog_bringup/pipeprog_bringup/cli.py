@@ -15,6 +15,7 @@ import click
 import typer
 
 from pipeprog_bringup.commands.board import board
+from pipeprog_bringup.commands.check import check
 from pipeprog_bringup.commands.detect import detect
 from pipeprog_bringup.commands.export import export
 from pipeprog_bringup.commands.fleet import fleet
@@ -35,7 +36,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
 )
 for panel, commands in {
-    "From recordings": (replay, fleet, detect),
+    "From recordings": (check, replay, fleet, detect),
     "To recordings": (ingest, board),
     "From results": (score, report, view, export),
 }.items():

@@ -20,6 +20,7 @@ from pipeprog_bringup.playback.session import Session, State
 from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, write_survey
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.recording_check import faults_of
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.nothing_found import why_nothing_was_found
@@ -81,6 +82,8 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     check_room(request.bag)
     inputs = _read(request)
     with OutputFolder(request.out, request.force) as folder, scratch_folder() as scratch:
+        if faults := faults_of(inputs.bag, inputs.board_file):
+            raise InputError("; ".join(faults))
         parameters = _parameters(request, inputs.configs, folder.file("colmap"))
         session = Session(inputs.bag, request.rate, report)
         with private_network(scratch), Graph(parameters, scratch, modules) as graph, _ros():
