@@ -32,6 +32,26 @@ class DeblurConfig:
 
 
 @dataclass(frozen=True)
+class CalibrationConfig:
+    """What is known of the camera's calibration, which the survey refines where its images tell better."""
+
+    focal_sigma: float = setting(
+        # Calibrations of one camera by a board differ by 0.1 to 0.3 %, mostly with focus and temperature.
+        0.003,
+        "relative standard deviation of the calibration's focal length; 0: the calibration is taken as it is",
+        "",
+        (0.0, 0.2),
+    )
+    distortion_sigma: float = setting(
+        # Of k1, as it differs between calibrations whose images leave the corners empty.
+        0.005,
+        "standard deviation of the calibration's k1; twice this for k2",
+        "",
+        (1e-6, 1.0),
+    )
+
+
+@dataclass(frozen=True)
 class BoardConfig:
     """Boards, scale bars and the scale."""
 
@@ -91,6 +111,7 @@ class SfmConfig:
     map_interval: int = setting(5, "number of keyframes between two publications of the map", "", (1, 1000))
     mapper: MapperConfig = field(default_factory=MapperConfig)
     deblur: DeblurConfig = field(default_factory=DeblurConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     board: BoardConfig = field(default_factory=BoardConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)

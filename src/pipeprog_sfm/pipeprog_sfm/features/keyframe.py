@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -44,6 +44,11 @@ class Keyframe:
         rays = (features.keypoints - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
         hull, cells = hull_area(features.keypoints), grid_cells(features.keypoints, (camera.width, camera.height))
         return Keyframe(stamp, features, camera, rays, np.array([camera.fx, camera.fy]), hull, cells)
+
+    def with_camera(self, camera: Camera) -> Keyframe:
+        """The same image with another calibration of it."""
+        pixels = camera.undistort_points(self.camera.distort_points(self.features.keypoints)).astype(np.float32)
+        return Keyframe.of(self.stamp, replace(self.features, keypoints=pixels), camera)
 
 
 def hull_area(pixels: NDArray[np.float32]) -> float:

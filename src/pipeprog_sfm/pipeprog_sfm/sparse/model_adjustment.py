@@ -42,6 +42,11 @@ def adjust_views(model: SparseModel, views: IntArray) -> None:
         model.filter(*used)
 
 
+def adjust_points(model: SparseModel) -> None:
+    """Adjusts all points; the views stay as they are."""
+    _adjust(model, np.zeros(len(model), bool), np.ones(len(model.points), bool), MAX_ITERATIONS, TOLERANCE)
+
+
 def pose_covariance(model: SparseModel, gradients: FloatArray) -> FloatArray:
     """(S, S) covariance of functions of the poses whose derivatives are (S, V, 6): see `function_covariance`."""
     ids, start, features = model.observations(np.ones(len(model.points), bool))

@@ -8,9 +8,11 @@ from collections.abc import Collection
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_camera.camera import Camera
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
-from pipeprog_sfm.sparse.model_adjustment import adjust_model, pose_covariance
+from pipeprog_sfm.sparse.guided_matching import link
+from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_points, pose_covariance
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
 from pipeprog_sfm.sparse.registration import rejection_reason
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -88,6 +90,21 @@ class SparseMap:
                 self.remove_view(model, view)
         model.adjusted_at = len(model)
         self.revision += 1
+
+    def replace_camera(self, told: Camera, camera: Camera) -> None:
+        """Gives all keyframes of one calibration another one; points and poses are adjusted."""
+        for stamp, keyframe in self.keyframes.items():
+            if keyframe.camera == told:
+                self.keyframes[stamp] = keyframe.with_camera(camera)
+        for model in self.models:
+            for view, stamp in enumerate(model.stamps):
+                model.replace_camera(view, self.keyframes[stamp].rays, self.keyframes[stamp].focal)
+            adjust_points(model)
+            self.adjust_globally(model)
+            # Tracks that the wrong camera had cut or kept apart.
+            for view in range(len(model)):
+                link(model, view, self.keyframes)
+            self.adjust_globally(model)
 
     def camera_from_model(self) -> dict[int, FloatArray]:
         """Poses (4, 4) of the published model's keyframes, in order of time."""

@@ -109,6 +109,11 @@ class SparseModel:
         self.focal = np.concatenate([self.focal, focal[None]])
         return view
 
+    def replace_camera(self, view: int, rays: FloatArray, focal: FloatArray) -> None:
+        """Gives a view the normalised coordinates (K, 2) of its features and the focal lengths of another camera."""
+        self._rays[self.features(view)] = rays
+        self.focal[view] = focal
+
     def link(self, features: IntArray, others: IntArray) -> None:
         """Turns matches of one view's features with features of other views (flat indices) into tracks.
 

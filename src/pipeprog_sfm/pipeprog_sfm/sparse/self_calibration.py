@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Focal length and radial distortion from the map itself, with the calibration as a prior.
+
+The camera is a small dense block beside the poses of a bundle adjustment: residuals are those of the image as it is,
+so that a camera which shrinks the image gains nothing. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from numpy.typing import NDArray
+
+from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.errors import InputError
+from pipeprog_sfm.config import CalibrationConfig
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
+from pipeprog_sfm.sparse.model_adjustment import CAUCHY
+from pipeprog_sfm.sparse.sparse_model import SparseModel
+
+NAMES = ("focal length", "k1", "k2")
+MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map
+MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera that its depth does not take up
+DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with more, the prior has decided
+SIGNIFICANT = 5.0  # standard deviations of a change: features share errors that the covariance knows in part only
+MAX_ITERATIONS = 15  # of Levenberg-Marquardt; 3 to 6 for a calibration, up to 12 for a guess, are needed
+CONVERGED = 0.1  # of its standard deviation, change of each number at which the iterations end
+STEP = 1e-6  # of numerical derivatives by rays, log focal length, k1 and k2: rounding gives them to 1e-9
+K2_SHARE = 2.0  # standard deviation of k2 over that of k1: it counts half as much where the image's corner has r = 0.7
+RADII = 8  # equal areas of the image, as rings, in which residuals are averaged
+MIN_IN_RING = 100  # residuals of a ring: their mean is known to a twentieth of a pixel
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A camera that the map agrees with better.
+
+    Attributes:
+        told: the camera that the map was made with.
+        camera: the refined one.
+        changes: (3,) of the logarithm of the focal length, of k1 and of k2.
+        sigmas: (3,) their standard deviations; infinite for what the data do not determine, which stays as it was.
+        shift: the most by which it moves a point of the image, px.
+        rotation: (V, 3, 3) camera_from_model of the views with it.
+        translation: (V, 3).
+    """
+
+    told: Camera
+    camera: Camera
+    changes: FloatArray
+    sigmas: FloatArray
+    shift: float
+    rotation: FloatArray
+    translation: FloatArray
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether a number differs by more than its own error and the prior's explain."""
+        return bool((np.abs(self.changes) > SIGNIFICANT * self.sigmas).any())
+
+
+@dataclass(frozen=True)
+class _State:
+    """What is adjusted: `numbers` (3,) change the camera's log focal length, k1 and k2."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    points: FloatArray
+    numbers: FloatArray
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Residuals (2K,), weighted, and their derivatives by poses and camera (2K, 6V + 3) and by points (K, 2, 3)."""
+
+    residuals: FloatArray
+    by_views: scipy.sparse.csr_matrix
+    by_point: FloatArray
+
+
+class _Problem:
+    """Observations of one camera in the image as it is, in units of their noise."""
+
+    def __init__(
+        self, model: SparseModel, camera: Camera, chosen: tuple[IntArray, IntArray, IntArray], prior: FloatArray
+    ) -> None:
+        self.ids, self.start, features = chosen
+        self.camera, self.prior = camera, prior
+        self.view = model.view_of[features].astype(np.int64)
+        self.owner = np.repeat(np.arange(len(self.ids)), np.diff(self.start))
+        ideal = model.rays[features] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        self.pixels = camera.distort_points(ideal)
+        self.noise = model.noise
+
+    def residuals(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(K, 2) errors in units of the noise, (K, 3) points in the cameras' frames turned only, (K, 2) rays."""
+        turned = np.einsum("kij,kj->ki", state.rotation[self.view], state.points[self.owner])
+        inside = turned + state.translation[self.view]
+        rays = inside[:, :2] / np.maximum(inside[:, 2:], 1e-9)
+        error = (pixels_of(changed(self.camera, state.numbers), rays) - self.pixels) / self.noise
+        return error, turned, rays
+
+    def cost(self, state: _State, told: FloatArray) -> float:
+        """Half of the sum of Cauchy losses, and of the prior's squares."""
+        error = self.residuals(state)[0]
+        robust = CAUCHY**2 * np.log1p((error**2).sum(axis=1) / CAUCHY**2).sum()
+        return 0.5 * float(robust + (((state.numbers - told) / self.prior) ** 2).sum())
+
+    def linearised(self, state: _State) -> _Rows:
+        """Rows at a state, with the square roots of the robust weights."""
+        error, turned, rays = self.residuals(state)
+        camera = changed(self.camera, state.numbers)
+        root = np.sqrt(1.0 / (1.0 + (error**2).sum(axis=1) / CAUCHY**2)) / self.noise
+        by_ray = np.stack([_difference(lambda h, i=i: pixels_of(camera, rays + h * np.eye(2)[i])) for i in (0, 1)], -1)
+        by_number = np.stack(
+            [
+                _difference(lambda h, i=i: pixels_of(changed(self.camera, state.numbers + h * np.eye(3)[i]), rays))
+                for i in range(3)
+            ],
+            axis=-1,
+        )
+        depth = turned[:, 2] + state.translation[self.view, 2]
+        slope = np.zeros((len(rays), 2, 3))
+        slope[:, 0, 0] = slope[:, 1, 1] = 1.0
+        slope[:, :, 2] = -rays
+        by_shift = by_ray @ slope * (root / np.maximum(depth, 1e-9))[:, None, None]
+        by_turn = np.cross(turned[:, None, :], by_shift)
+        by_point = by_shift @ state.rotation[self.view]
+        columns = np.c_[6 * self.view[:, None] + np.arange(6), np.tile(6 * len(state.rotation) + np.arange(3), (len(rays), 1))]
+        data = np.concatenate([by_turn, by_shift, by_number * root[:, None, None]], axis=-1)
+        rows = np.arange(2 * len(rays)).reshape(-1, 2, 1)
+        by_views = scipy.sparse.csr_matrix(
+            (data.ravel(), (np.broadcast_to(rows, data.shape).ravel(), np.repeat(columns, 2, axis=0).ravel())),
+            shape=(2 * len(rays), 6 * len(state.rotation) + 3),
+        )
+        return _Rows((error * self.noise * root[:, None]).ravel(), by_views, by_point)
+
+
+def refine(
+    model: SparseModel, keyframes: Mapping[int, Keyframe], told: Camera, config: CalibrationConfig
+) -> Refinement | None:
+    """The camera refined on a model's observations; None where the data do not tell it from the one in use.
+
+    Args:
+        model: adjusted views of one camera.
+        keyframes: at least those of the model's views, by stamp; all have the camera in use.
+        told: the calibration, to which the priors of `config` apply.
+        config: standard deviations of the calibration.
+    """
+    camera = keyframes[model.stamps[0]].camera
+    chosen = _sample(model)
+    if chosen is None:
+        return None
+    prior = np.array([config.focal_sigma, config.distortion_sigma, K2_SHARE * config.distortion_sigma])
+    offset = numbers_of(told) - numbers_of(camera)  # the prior's centre, from the camera in use
+    free = np.ones(3, bool)
+    while free.any():
+        held = np.where(free, prior, 1e-9)
+        problem = _Problem(model, camera, chosen, held)
+        state, sigmas = _adjusted(problem, model, np.where(free, offset, 0.0))
+        determined = free & (sigmas < DETERMINED * prior)
+        if (determined == free).all():
+            break
+        free = determined
+    if not free.any():
+        return None
+    found = changed(camera, state.numbers)
+    return Refinement(
+        camera, found, state.numbers, np.where(free, sigmas, np.inf), largest_shift(camera, found),
+        state.rotation, state.translation,
+    )  # fmt: skip
+
+
+def numbers_of(camera: Camera) -> FloatArray:
+    """(3,) logarithm of the focal length, k1 and k2."""
+    k1, k2 = (*camera.distortion, 0.0, 0.0)[:2]
+    return np.array([0.5 * np.log(camera.fx * camera.fy), k1, k2])
+
+
+def changed(camera: Camera, numbers: FloatArray) -> Camera:
+    """The camera with its log focal length, k1 and k2 changed by (3,) numbers."""
+    known = camera.distortion or (0.0, 0.0, 0.0, 0.0)
+    factor = float(np.exp(numbers[0]))
+    coefficients = (known[0] + float(numbers[1]), known[1] + float(numbers[2]), *known[2:])
+    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor, distortion=coefficients)
+
+
+def pixels_of(camera: Camera, rays: FloatArray) -> FloatArray:
+    """(K, 2) pixels of the image as it is where the camera shows (K, 2) normalised image coordinates."""
+    return camera.distort_points(rays * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+
+
+def converted(pixels: FloatArray, camera: Camera, other: Camera) -> FloatArray:
+    """(N, 2) pixels of a camera's ideal pinhole image -> those of another calibration of the same image."""
+    return other.undistort_points(camera.distort_points(pixels))
+
+
+def largest_shift(camera: Camera, other: Camera) -> float:
+    """The most by which another calibration moves a point of the image, px, over a grid of 9 x 9 points."""
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))
+    grid = np.c_[x.ravel(), y.ravel()]
+    rays = (camera.undistort_points(grid) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    shift = np.linalg.norm(pixels_of(other, rays) - grid, axis=1)
+    return float(np.max(shift, initial=0.0, where=np.isfinite(shift)))
+
+
+def radial_residuals(model: SparseModel, camera: Camera) -> FloatArray:
+    """(RADII,) mean residual away from the principal point, px, in rings of equal area; NaN where too few are seen.
+
+    Zero throughout where focal length and distortion are right.
+    """
+    features = np.flatnonzero(model.point_of >= 0)
+    view = model.view_of[features]
+    inside = np.einsum("kij,kj->ki", model.rotation[view], model.points[model.point_of[features]])
+    inside += model.translation[view]
+    rays = model.rays[features]
+    radius = np.linalg.norm(rays, axis=1)
+    outward = rays / np.maximum(radius, 1e-9)[:, None]
+    error = ((inside[:, :2] / inside[:, 2:] - rays) * model.focal[view] * outward).sum(axis=1)
+    corner = 0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy)
+    ring = np.minimum((RADII * (radius / corner) ** 2).astype(int), RADII - 1)
+    count = np.bincount(ring, minlength=RADII)
+    mean = np.bincount(ring, -error, minlength=RADII) / np.maximum(count, 1)
+    return np.where(count >= MIN_IN_RING, mean, np.nan)
+
+
+def _sample(model: SparseModel) -> tuple[IntArray, IntArray, IntArray] | None:
+    """Observations of up to MAX_POINTS points with tracks of MIN_TRACK views, as `SparseModel.observations`."""
+    count = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points))
+    long = np.flatnonzero(count >= MIN_TRACK)
+    if len(long) < MAX_POINTS // 20:
+        return None
+    wanted = np.zeros(len(model.points), bool)
+    wanted[long[np.unique(np.linspace(0, len(long) - 1, MAX_POINTS).astype(int))]] = True
+    return model.observations(wanted)
+
+
+def _adjusted(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[_State, FloatArray]:
+    """The adjusted state, and the (3,) standard deviations of its numbers with the prior.
+
+    told (3,): the prior's centre, as a change of the camera in use.
+    """
+    state = _State(model.rotation.copy(), model.translation.copy(), model.points[problem.ids], np.zeros(3))
+    cost, damping = problem.cost(state, told), 1e-4
+    for _ in range(MAX_ITERATIONS):
+        rows = problem.linearised(state)
+        sigmas = _sigmas(problem, rows)
+        before = state.numbers
+        while damping < 1e3:
+            step, moves = _step(problem, rows, (told - state.numbers) / problem.prior**2, damping)
+            trial = _moved(state, step, moves)
+            new_cost = problem.cost(trial, told)
+            if new_cost < cost:
+                state, cost, damping = trial, new_cost, max(damping * 0.1, 1e-9)
+                break
+            damping *= 10
+        else:
+            break
+        if (np.abs(state.numbers - before) <= CONVERGED * sigmas).all():
+            break
+    return state, _sigmas(problem, problem.linearised(state))
+
+
+def _moved(state: _State, step: FloatArray, moves: FloatArray) -> _State:
+    pose = step[:-3].reshape(-1, 6)
+    return _State(
+        rotation_from_vector(pose[:, :3]) @ state.rotation,
+        state.translation + pose[:, 3:],
+        state.points + moves,
+        state.numbers + step[-3:],
+    )
+
+
+def _eliminated(
+    problem: _Problem, rows: _Rows, damping: float
+) -> tuple[scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, FloatArray, scipy.sparse.csr_matrix]:
+    """Normal matrix of views and camera without the points, its coupling (6V + 3, 3P), inverses (P, 3, 3), and both."""
+    first, count = problem.start[:-1], len(problem.ids)
+    own = np.add.reduceat(rows.by_point.transpose(0, 2, 1) @ rows.by_point, first, axis=0)
+    own[:, range(3), range(3)] *= 1 + damping
+    own[:, range(3), range(3)] += 1e-12
+    inverse = np.linalg.inv(own)
+    columns = 3 * problem.owner[:, None, None] + np.arange(3)
+    row = np.arange(2 * len(problem.view)).reshape(-1, 2, 1)
+    shape = rows.by_point.shape
+    by_points = scipy.sparse.csr_matrix(
+        (rows.by_point.ravel(), (np.broadcast_to(row, shape).ravel(), np.broadcast_to(columns, shape).ravel())),
+        shape=(2 * len(problem.view), 3 * count),
+    )
+    coupling = (rows.by_views.T @ by_points).tocsr()
+    blocks = scipy.sparse.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
+    lifted = (coupling @ blocks).tocsr()
+    normal = (rows.by_views.T @ rows.by_views).tocsc()
+    diagonal = normal.diagonal() * damping + 1e-9
+    diagonal[:6] += 1e12  # the first view holds the model's place
+    diagonal[-3:] += 1.0 / problem.prior**2
+    return (normal + scipy.sparse.diags(diagonal) - lifted @ coupling.T).tocsc(), coupling, inverse, lifted
+
+
+def _step(
+    problem: _Problem, rows: _Rows, pull: FloatArray, damping: float
+) -> tuple[FloatArray, FloatArray]:
+    """Step (6V + 3,) of poses and camera and (P, 3) of the points; pull (3,): the prior's gradient."""
+    reduced, coupling, inverse, lifted = _eliminated(problem, rows, damping)
+    gradient = -(rows.by_views.T @ rows.residuals)
+    gradient[-3:] += pull
+    along = np.einsum("kji,kj->ki", rows.by_point, rows.residuals.reshape(-1, 2))
+    points = -np.add.reduceat(along, problem.start[:-1], axis=0)
+    step = scipy.sparse.linalg.splu(reduced).solve(gradient - lifted @ points.ravel())
+    moves = np.einsum("pij,pj->pi", inverse, points - (coupling.T @ step).reshape(-1, 3))
+    return step, moves
+
+
+def _sigmas(problem: _Problem, rows: _Rows) -> FloatArray:
+    """(3,) standard deviations of the numbers: errors of points independent (sandwich covariance), with the prior.
+
+    As `function_covariance` of the bundle adjustment.
+    """
+    reduced, coupling, inverse, _ = _eliminated(problem, rows, 0.0)
+    size = reduced.shape[0]
+    unit = np.zeros((size, 3))
+    unit[-3:] = np.eye(3)
+    answer = scipy.sparse.linalg.splu(reduced + 1e-9 * scipy.sparse.identity(size, format="csc")).solve(unit)
+    moves = -np.einsum("pij,pjn->pin", inverse, (coupling.T @ answer).reshape(-1, 3, 3))
+    lines = (rows.by_views @ answer).reshape(-1, 2, 3) + rows.by_point @ moves[problem.owner]
+    scores = np.add.reduceat(np.einsum("kin,ki->kn", lines, rows.residuals.reshape(-1, 2)), problem.start[:-1], axis=0)
+    observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + size - 6
+    spread = np.diag(scores.T @ scores) * observed / max(observed - unknown, 1)
+    by_prior = (answer[-3:] / problem.prior[:, None]) ** 2
+    return np.sqrt(spread + by_prior.sum(axis=0))
+
+
+def _difference(function: Callable[[float], FloatArray], step: float = STEP) -> FloatArray:
+    """Central difference of a function of one number at zero."""
+    return (function(step) - function(-step)) / (2 * step)
