@@ -91,7 +91,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
         with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
             recording.describe(_described(request))
             record_survey(recording, survey, status)
-            record_keyframes(recording, inputs.bag, session.log, survey.poses)
+            record_keyframes(recording, inputs.bag, session.log, survey)
         started = time.monotonic()
         product = write_survey(folder, survey, session.log, request.with_cloud)
         points = points_from_cloud(survey.cloud)[0]
@@ -102,7 +102,7 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             registered=status.keyframes_registered,
             notes=[
                 *inputs.bag.notes,
-                *filter(None, [status.message]),
+                *filter(None, [status.calibration, status.message]),
                 *why_nothing_was_found(product, points, inputs.boq),
             ],
             losses=inputs.bag.losses + session.log.faults(),

@@ -35,6 +35,13 @@ class Keyframes:
         self._encoded[stamp] = (encoded, camera)
         self._images.pop(stamp, None)
 
+    def replace_camera(self, camera: Camera) -> bool:
+        """Gives all keyframes this calibration; whether one had another."""
+        others = [stamp for stamp, (_, own) in self._encoded.items() if own != camera]
+        for stamp in others:
+            self.add(stamp, self._encoded[stamp][0], camera)
+        return bool(others)
+
     def remove(self, stamp: int) -> None:
         """Forgets a keyframe."""
         del self._encoded[stamp]

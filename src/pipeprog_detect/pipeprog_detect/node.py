@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -45,14 +45,15 @@ from pipeprog_node import messages, qos, received
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
-from pipeprog_node.keyframe_input import IMAGES, KeyframeInput
+from pipeprog_node.keyframe_input import IMAGES, REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
-from pipeprog_node.received import ReceivedCloud, ReceivedPoses, ReceivedStatus
+from pipeprog_node.received import ReceivedCamera, ReceivedCloud, ReceivedPoses, ReceivedStatus
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 
 POINTS, POSES = "map_points", "keyframe_poses"
+MAP_PARTS = (ReceivedStatus, ReceivedPoses, ReceivedCloud)
 MAX_PENDING = 16  # stamps of which one message of three has arrived: poses come after each keyframe, maps rarely
 TICK = 1.0  # s
 # Ticks without a keyframe that a map contains, until the map does without. Both come from this machine or its network
@@ -61,11 +62,12 @@ PATIENCE = 10
 
 
 class CompleteMap(NamedTuple):
-    """The parts of a map."""
+    """The parts of a map; `camera` where the survey has refined the calibration."""
 
     status: ReceivedStatus
     poses: ReceivedPoses
     cloud: ReceivedCloud
+    camera: ReceivedCamera | None
 
 
 class MapInput:
@@ -82,14 +84,16 @@ class MapInput:
         self.revision = 0
         intake.subscribe(PointCloud2, POINTS, received.map_points, self._keep, qos.latched())
         intake.subscribe(Path, POSES, received.keyframe_poses, self._keep, qos.latched())
+        intake.subscribe(CameraInfo, REFINED_CALIBRATION, received.camera_info, self._keep, qos.latched())
         intake.subscribe(msg.SfmStatus, "sfm_status", received.sfm_status, self._on_status, qos.latched())
 
     @property
     def newest(self) -> CompleteMap | None:
         """The complete map whose first part came last."""
         for parts in reversed(self._parts.values()):
-            if len(parts) == len(CompleteMap._fields):
-                return CompleteMap(parts[ReceivedStatus], parts[ReceivedPoses], parts[ReceivedCloud])
+            if _is_complete(parts):
+                status, poses, cloud = (parts[kind] for kind in MAP_PARTS)
+                return CompleteMap(status, poses, cloud, parts[ReceivedCamera] if status.camera_refined else None)
         return None
 
     def discard(self, taken: CompleteMap) -> None:
@@ -101,10 +105,10 @@ class MapInput:
         if status.revision:
             self._keep(status)
 
-    def _keep(self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus) -> None:
+    def _keep(self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus | ReceivedCamera) -> None:
         parts = self._parts.setdefault(part.stamp, {})
         parts[type(part)] = part
-        if len(parts) == len(CompleteMap._fields):
+        if _is_complete(parts):
             self.revision = max(self.revision, parts[ReceivedStatus].revision)
         while len(self._parts) > MAX_PENDING or (len(self._parts) > 1 and self._points() > MAX_CLOUD_POINTS):
             self._parts.popitem(last=False)
@@ -113,6 +117,13 @@ class MapInput:
     def _points(self) -> int:
         clouds = [parts[ReceivedCloud] for parts in self._parts.values() if ReceivedCloud in parts]
         return sum(len(cloud.points) for cloud in clouds)
+
+
+def _is_complete(parts: Mapping[type, Any]) -> bool:
+    """Whether all that belongs to a map has come."""
+    return all(kind in parts for kind in MAP_PARTS) and (
+        not parts[ReceivedStatus].camera_refined or ReceivedCamera in parts
+    )
 
 
 class PipeOutput:
@@ -203,12 +214,13 @@ class DetectNode(Node):
         newest = self._maps.newest
         if newest is None or not self._supervision.takes_requests:
             return
-        status, poses, cloud = newest
+        status, poses, cloud, refined = newest
         final = self._finish.expected is not None and status.revision >= self._finish.expected
         if not (self._intermediate or final) or self._missing(poses):
             return
         self._maps.discard(newest)
-        command = Map(status.revision, cloud.points, cloud.normals, poses.stamps, poses.map_from_camera, final)
+        camera = refined.camera if refined else None
+        command = Map(status.revision, cloud.points, cloud.normals, poses.stamps, poses.map_from_camera, final, camera)
         if self._supervision.is_poison(command):
             self._refuse(status.revision, "detection processes died of this map before: it is not tried again")
             return

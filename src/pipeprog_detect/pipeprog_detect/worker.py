@@ -41,7 +41,7 @@ class Keyframe:
 class Map:
     """Command: detect in this map; poses (M, 4, 4) map_from_camera belong to stamps (M,).
 
-    What is found in a `final` map does not depend on the maps before it.
+    What is found in a `final` map does not depend on the maps before it. A `camera` replaces that of all keyframes.
     """
 
     revision: int
@@ -50,11 +50,12 @@ class Map:
     stamps: NDArray[np.int64]
     map_from_camera: NDArray[np.float64]
     final: bool
+    camera: Camera | None = None
 
     @property
     def content(self) -> tuple[object, ...]:
         """What is recognised when it comes again, under another revision, too."""
-        return self.points, self.normals, self.stamps, self.map_from_camera
+        return self.points, self.normals, self.stamps, self.map_from_camera, self.camera
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,8 @@ def serve(
         if isinstance(command, Keyframe):
             keyframes.add(command.stamp, command.encoded, command.camera)
             continue
+        if command.camera is not None and keyframes.replace_camera(command.camera):
+            memory = MeasurementCache()
         views = list(_views(connection, command, keyframes))
         memory.next_map()
         if command.final:

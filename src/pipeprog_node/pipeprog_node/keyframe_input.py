@@ -15,6 +15,8 @@ from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.received import ReceivedCamera, ReceivedImage
 
 IMAGES, CALIBRATIONS = "keyframes/image/compressed", "keyframes/camera_info"
+# The camera as the survey's images tell it, where it differs from the calibration: with the stamp of a map.
+REFINED_CALIBRATION = "keyframes/refined_camera_info"
 DEPTH = 50  # of both topics: keyframes that come while the node is busy
 
 _Key = tuple[int, str]  # stamp [ns] and frame of a camera

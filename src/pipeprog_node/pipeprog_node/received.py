@@ -140,6 +140,7 @@ class ReceivedStatus:
     scale_source: str
     scale_sigma: float
     readout: float = 0.0
+    camera_refined: bool = False
 
 
 @dataclass(frozen=True)
@@ -422,4 +423,11 @@ def sfm_status(message: SfmStatus) -> ReceivedStatus:
     if message.map_revision and not 0.0 <= message.scale_sigma < np.inf:
         raise InvalidMessageError("scale", f"scale_sigma is {message.scale_sigma:g}: a map has one, zero or larger")
     _check_readout(message.readout)
-    return ReceivedStatus(stamp, message.map_revision, message.scale_source, message.scale_sigma, message.readout)
+    return ReceivedStatus(
+        stamp,
+        message.map_revision,
+        message.scale_source,
+        message.scale_sigma,
+        message.readout,
+        message.camera_refined,
+    )

@@ -66,6 +66,10 @@ class Deblurrer:
         for stamp in stamps:
             self._images.pop(stamp, None)
 
+    def replace_camera(self, camera: Camera) -> None:
+        """The images that wait have another calibration now."""
+        self._images = {stamp: EncodedImage(image.data, camera) for stamp, image in self._images.items()}
+
     def _features(
         self,
         stamps: tuple[int, int, int],
@@ -85,9 +89,7 @@ class Deblurrer:
         length = np.linalg.norm(blur(image.camera, points, motion, exposure), axis=1)
         if np.median(length) < self._config.deblur.min_length:
             return None
-        gray = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-        assert gray is not None  # it could be decoded when it was added
-        sharp = deblur(gray, image.camera, points, motion, exposure)
+        sharp = deblur(image.gray(), image.camera, points, motion, exposure)
         return extract(sharp, image.camera, self._config.mapper)
 
 

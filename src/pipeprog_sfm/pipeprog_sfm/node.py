@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import Imu, PointCloud2
+from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
@@ -28,7 +28,7 @@ from pipeprog_node import messages, qos, received
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
-from pipeprog_node.keyframe_input import KeyframeInput
+from pipeprog_node.keyframe_input import REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
 from pipeprog_node.received import (
@@ -161,6 +161,8 @@ class MapOutput:
         self._points = node.create_publisher(PointCloud2, "map_points", qos.latched())
         self._poses = node.create_publisher(Path, "keyframe_poses", qos.latched())
         self._statuses = node.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
+        self._cameras = node.create_publisher(CameraInfo, REFINED_CALIBRATION, qos.latched())
+        self._camera_refined = False
 
     def publish_overlap(self, header: Header, reports: Sequence[OverlapReport], keyframes: int, retired: int) -> None:
         """Overlap after so far considered `keyframes` and `retired` messages of retirement."""
@@ -191,11 +193,14 @@ class MapOutput:
         self._poses.publish(messages.path(header, trajectory.stamps, trajectory.map_from_camera))
         return header
 
-    def publish_map(self, metric_map: MetricMap) -> None:
-        """Poses and cloud of a new map, both under the same stamp."""
+    def publish_map(self, metric_map: MetricMap, camera_frame: str) -> None:
+        """Poses and cloud of a new map, and the camera where it was refined, all under the same stamp."""
         self.revision += 1
         header = self.publish_poses(metric_map.trajectory)
         self._map_stamp = self._pose_stamp
+        self._camera_refined = metric_map.refined_camera is not None
+        if metric_map.refined_camera is not None:
+            self._cameras.publish(messages.info_from_camera(metric_map.refined_camera, self._map_stamp, camera_frame))
         if metric_map.scale.frame != self.frame:
             self.frame = metric_map.scale.frame
             self._logger.info(f"frame map: {self.frame}")
@@ -223,6 +228,8 @@ class MapOutput:
                 scale_source=scale.source if scale else "",
                 scale_sigma=scale.sigma if scale else np.nan,
                 motion_considered=motion_considered,
+                camera_refined=self._camera_refined,
+                calibration=status.calibration,
                 message=status.message,
             )
         )
@@ -252,6 +259,7 @@ class SfmNode(Node):
         self._retirements: list[ReceivedRetirement] = []  # to be applied after the keyframes before them
         self._retiring: deque[ReceivedRetirement] = deque()  # at the worker
         self._seen = self._last_stamp = 0
+        self._camera_frame = ""  # of the newest keyframe
         self._finish_sent = False
         depth = qos.reliable(MAX_BACKLOG)
         self._intake.subscribe(msg.KeyframesRetired, RETIRED, received.retirement, self._on_retired, depth)
@@ -270,6 +278,7 @@ class SfmNode(Node):
     def _on_keyframe(self, stamp: int, encoded: bytes, camera: Camera, frame_id: str) -> None:
         self._seen += 1
         self._last_stamp = max(self._last_stamp, stamp)
+        self._camera_frame = frame_id
         keyframe = AddKeyframe(stamp, encoded, camera, frame_id)
         if self._supervision.is_poison(keyframe):
             self._leave_out(keyframe)
@@ -325,7 +334,7 @@ class SfmNode(Node):
             self._supervision.answered()
             self._end_retirement(event.overlaps)
         elif isinstance(event, MapReady):
-            self._output.publish_map(event.map)
+            self._output.publish_map(event.map, self._camera_frame)
         self._publish_status()
         if isinstance(event, Finished):
             self._supervision.fulfilled()

@@ -18,6 +18,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_sfm.boards.board_file import BoardFile
+from pipeprog_sfm.camera_in_use import CameraInUse, board_agrees, radial_warning
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, centre
@@ -47,6 +48,7 @@ class Status:
     reprojection_error: float = 0.0
     scale: ScaleEstimate | None = None
     message: str = ""
+    calibration: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,12 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class MetricMap:
-    """The map in metres: the poses, the cloud that goes with them, and the scale of both."""
+    """The map in metres: the poses, the cloud that goes with them, the scale of both, and the camera if refined."""
 
     scale: ScaleEstimate
     trajectory: Trajectory
     cloud: FusedCloud
+    refined_camera: Camera | None = None
 
 
 class Reconstruction:
@@ -89,6 +92,7 @@ class Reconstruction:
         self._config = config
         self._deblurrer = Deblurrer(config)
         self._metric_tracker = MetricTracker(board_file, config.board, config.odometry, sources)
+        self._camera = CameraInUse(config.calibration)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
         self._pending: tuple[ScaleEstimate, Trajectory, Future[FusedCloud]] | None = None
@@ -98,6 +102,7 @@ class Reconstruction:
         self._due = 0.0  # sightings at which the scale is estimated again
         self._reason = "no keyframe has been registered yet"
         self._problem = ""
+        self._radial_warning = ""
 
     def add(self, stamp: int, encoded: bytes, camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe (JPEG or PNG bytes, stamp in ns, the camera's frame); InputError when it cannot be used."""
@@ -112,6 +117,7 @@ class Reconstruction:
                 f"the image has {gray.shape[1]} x {gray.shape[0]} pixels, its CameraInfo says "
                 f"{camera.width} x {camera.height}: calibrate at the size that the camera sends"
             )
+        camera = self._camera.of(camera)
         self._images[stamp] = EncodedImage(encoded, camera)
         # Features and boards are measured in the image as it is: their points are undistorted, not resampled.
         self._sightings += bool(self._metric_tracker.add(stamp, gray, camera, frame))
@@ -119,6 +125,8 @@ class Reconstruction:
         poses = self._map.camera_from_model()
         for other, features in self._deblurrer.deblurred(stamp, self._images[stamp], poses, self._map.points_seen):
             self._mapper.replace_features(other, features)
+        if self._camera.is_due(len(self._map.published)):
+            self._refine_camera(final=False)
         return report
 
     def update_dense(self) -> None:
@@ -149,6 +157,9 @@ class Reconstruction:
     def finish(self) -> MetricMap:
         """Registers what still can be, adjusts everything, and makes the final map; raises NotMetricError."""
         self._mapper.finish()
+        if self._camera.config.focal_sigma > 0 and self._refine_camera(final=True):
+            self._mapper.finish()
+        self._radial_warning = radial_warning(self._map.radial_residuals())
         self._scaled = -1
         self._request(settled=True, anew=True)
         return self._take()
@@ -170,7 +181,8 @@ class Reconstruction:
 
     def status(self) -> Status:
         """Health so far."""
-        message = self._problem or ("; ".join(self._scale.warnings) if self._scale else self._reason)
+        warnings = (*self._scale.warnings, self._radial_warning) if self._scale else ()
+        message = self._problem or ("; ".join(filter(None, warnings)) if self._scale else self._reason)
         if len(self._map.models) > 1:
             elsewhere = len(self._map.keyframes) - len(self._map.waiting) - len(self._map.published)
             message = "; ".join(
@@ -185,6 +197,7 @@ class Reconstruction:
             self._map.reprojection_error(),
             self._scale,
             message,
+            self._camera.description(),
         )
 
     def trajectory(self) -> Trajectory:
@@ -226,7 +239,33 @@ class Reconstruction:
                 "walk past it, sideways, or have more keyframes chosen (frames.overlap_min)"
             )
             raise NotMetricError(self._reason)
-        return MetricMap(scale, trajectory, points)
+        return MetricMap(scale, trajectory, points, self._camera.refined)
+
+    def _refine_camera(self, final: bool) -> bool:
+        """Goes on with the camera that the map says, where the boards agree; whether it does."""
+        poses = self._map.camera_from_model()
+        if not poses:
+            return False
+        used = self._images[next(iter(poses))].camera
+        found = self._mapper.self_calibration(self._camera.told(used), self._camera.config)
+        if found is None or not self._camera.is_better(found, final):
+            return False
+        images = {stamp: image for stamp, image in self._images.items() if image.camera == found.told}
+        if len(images) < len(self._images):  # the detector is told one camera for all keyframes
+            return False
+        measured = self._metric_tracker.remeasured(
+            ((stamp, image.gray()) for stamp, image in images.items()), found.camera
+        )
+        if not board_agrees(self._metric_tracker.board_misfit(poses), measured.board_misfit(found.poses)):
+            return False
+        self._camera.accept(found)
+        self._metric_tracker = measured
+        for stamp, image in images.items():
+            self._images[stamp] = EncodedImage(image.data, found.camera)
+        self._deblurrer.replace_camera(found.camera)
+        self._mapper.take_camera(found)
+        self._dense.clear()
+        return True
 
     def _metric(self) -> tuple[ScaleEstimate, Trajectory]:
         """The scale, estimated again when the map has moved or more of the boards was seen, and the metric poses."""

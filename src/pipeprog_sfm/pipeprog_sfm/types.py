@@ -5,6 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeprog_camera.camera import Camera
 
 
@@ -14,3 +18,9 @@ class EncodedImage:
 
     data: bytes
     camera: Camera
+
+    def gray(self) -> NDArray[np.uint8]:
+        """(H, W) pixels as the camera saw them; it could be decoded when it was added."""
+        gray = cv2.imdecode(np.frombuffer(self.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert gray is not None
+        return np.asarray(gray, np.uint8)

@@ -9,7 +9,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMsg
 from rclpy.node import Node
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import CameraInfo, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from pipeprog_bringup.playback.frame_log import FrameLog
@@ -17,7 +17,9 @@ from pipeprog_bringup.playback.watchdog import Watchdog
 from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
+from pipeprog_node.keyframe_input import REFINED_CALIBRATION
 
+_OPTIONAL = {"refined": (CameraInfo, REFINED_CALIBRATION)}
 _RESULTS = {"cloud": (PointCloud2, "map_points"), "poses": (PathMsg, "keyframe_poses")} | {
     "pipes": (msg.PipeArray, "pipes"),
     "markers": (MarkerArray, "pipe_markers"),
@@ -26,12 +28,13 @@ _RESULTS = {"cloud": (PointCloud2, "map_points"), "poses": (PathMsg, "keyframe_p
 
 @dataclasses.dataclass(frozen=True)
 class LastMessages:
-    """The last messages of the graph, all of one map."""
+    """The last messages of the graph, all of one map; `refined` where the survey has refined the calibration."""
 
     cloud: PointCloud2
     poses: PathMsg
     pipes: msg.PipeArray
     markers: MarkerArray
+    refined: CameraInfo | None = None
 
 
 class Listener:
@@ -53,7 +56,7 @@ class Listener:
     def receive(self, *names: str) -> None:
         """Subscribe to results that are complete (cloud, poses, pipes, markers): just the last message comes."""
         for name in names:
-            kind, topic = _RESULTS[name]
+            kind, topic = (_RESULTS | _OPTIONAL)[name]
 
             def keep(message: Any, name: str = name) -> None:
                 self._results[name] = message
@@ -71,6 +74,8 @@ class Listener:
             return f"these results have not come: {', '.join(absent)}"
         pipes = self._results["pipes"]
         stamps = {name: self._results[name].header.stamp for name in ("cloud", "poses", "pipes")}
+        if self.status.camera_refined and "refined" not in self._results:
+            return f"these results have not come: {REFINED_CALIBRATION}"
         newest = min(self.status.map_revision, pipes.map_revision) >= revision
         if newest and all(stamp == stamps["pipes"] for stamp in stamps.values()):
             return ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Transform, TransformStamped, Vector3
-from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 from tf2_msgs.msg import TFMessage
@@ -59,9 +58,10 @@ def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmSta
         recording.write(f"/{topic}", _type_name(type(message)), serialize_message(message), stamp, latched=True)
 
 
-def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, poses: Path) -> None:
-    """Write the keyframes into out.mcap, each with the calibration that was sent with it and its camera's transform."""
-    places = {messages.stamp_ns(place.header.stamp): place for place in poses.poses}
+def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: LastMessages) -> None:
+    """Write the keyframes into out.mcap, each with the calibration that was used and its camera's transform."""
+    places = {messages.stamp_ns(place.header.stamp): place for place in survey.poses.poses}
+    refined = None if survey.refined is None else messages.camera_from_info(survey.refined)
     chosen = {row.stamp for row in log.rows() if row.chosen}
     for frame in bag:
         if frame.stamp not in chosen or frame.fault:
@@ -71,7 +71,8 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, poses: Path)
         if bag.image_type == cdr.IMAGE:
             encoded = messages.encode_jpeg(messages.image_from_msg(deserialize_message(data, Image)))
             data = cdr.write_compressed_image(frame.stamp, frame.frame_id, "jpeg", encoded)
-        info = serialize_message(calibration(frame))
+        used = messages.info_from_camera(refined, frame.stamp, frame.frame_id) if refined else calibration(frame)
+        info = serialize_message(used)
         recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, info, frame.stamp)
         recording.write("/keyframes/image/compressed", cdr.COMPRESSED_IMAGE, data, frame.stamp)
         if frame.stamp in places:

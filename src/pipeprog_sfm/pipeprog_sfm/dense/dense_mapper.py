@@ -102,6 +102,12 @@ class DenseMapper:
         for stamp in [stamp for stamp, other in self._covered.items() if other in stamps]:
             del self._covered[stamp]
 
+    def clear(self) -> None:
+        """Gives up all depth maps and the cloud: the images have another calibration now."""
+        for known in (self._depths, self._covered, self._refused, self._waiting):
+            known.clear()
+        self._thread.submit(self._start_anew)
+
     def fuse(
         self,
         camera_from_map: Mapping[int, FloatArray],
@@ -175,6 +181,9 @@ class DenseMapper:
         pose = reference.camera_from_world
         return _Depth(result, {other.stamp: distance(pose, other.camera_from_world) for other in neighbours})
 
+    def _start_anew(self) -> None:
+        self._fusion, self._fused = Fusion(self._fusion_config), {}
+
     def _fuse(
         self,
         maps: Mapping[int, tuple[Future[_Depth], FloatArray]],
@@ -185,7 +194,7 @@ class DenseMapper:
         poses = {stamp: pose for stamp, (_, pose) in maps.items()}
         moved = [distance(poses[stamp], pose) for stamp, pose in self._fused.items() if stamp in poses]
         if anew or max(moved, default=0.0) > self._fusion_config.voxel:
-            self._fusion, self._fused = Fusion(self._fusion_config), {}
+            self._start_anew()
         for stamp, (future, pose) in maps.items():
             if stamp in self._fused:
                 continue

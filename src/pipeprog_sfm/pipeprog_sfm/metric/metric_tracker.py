@@ -14,6 +14,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile
+from pipeprog_sfm.boards.board_triangulation import place_boards
 from pipeprog_sfm.boards.ellipses import ImageEllipses, detect_ellipses
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.metric.metric_frame import estimate_scale
@@ -102,9 +103,28 @@ class MetricTracker:
         Raises:
             NoScaleError: as `estimate_scale`.
         """
-        cameras = Counter(self._cameras[stamp] for stamp in poses if stamp in self._cameras)
-        if not cameras:
+        if not any(stamp in self._cameras for stamp in poses):
             raise NoScaleError("no_board", "no keyframe has been seen yet")
+        return estimate_scale(self._posed(poses, points), covariance, self._sources)
+
+    def board_misfit(self, poses: Mapping[int, FloatArray]) -> float | None:
+        """By how many px the boards' circles, in their images, differ from their file; None where none is placed."""
+        posed = self._posed(poses, None)
+        placed = place_boards(posed.seen.observations, posed.posed_camera, self._board_file.boards, posed.seen.ellipses)
+        return max((float(np.hypot(place.centre_sigma, place.pose_sigma)) for place in placed), default=None)
+
+    def remeasured(self, images: Iterable[tuple[int, NDArray[np.uint8]]], camera: Camera) -> MetricTracker:
+        """The same with boards measured by another calibration; images: all keyframes, (H, W) uint8 by stamp."""
+        other = MetricTracker(self._board_file, self._config, self._odometry, self._sources)
+        for stamp, gray in images:
+            other.add(stamp, gray, camera, self._frames[stamp])
+        other._first_frame = self._first_frame
+        other._transforms, other._accelerations = self._transforms, self._accelerations
+        return other
+
+    def _posed(self, poses: Mapping[int, FloatArray], points: Callable[[], FloatArray] | None) -> PosedEvidence:
+        """What was seen, in pixels of one camera, at given poses."""
+        cameras = Counter(self._cameras[stamp] for stamp in poses if stamp in self._cameras)
         # A camera may switch its resolution, and a robot has several: all is measured in pixels of the usual one. Noise
         # is taken to be the same number of these in every image, which is right for most of them.
         camera = cameras.most_common(1)[0][0]
@@ -124,8 +144,7 @@ class MetricTracker:
             self._usual_frame(poses),
             self._frames,
         )
-        posed = PosedEvidence(seen, poses, camera, self._config, self._odometry, points)
-        return estimate_scale(posed, covariance, self._sources)
+        return PosedEvidence(seen, poses, camera, self._config, self._odometry, points)
 
     def _usual_frame(self, poses: Mapping[int, FloatArray]) -> str:
         """The frame that is followed by odometry and IMU: the first one, unless another has twice as many keyframes.

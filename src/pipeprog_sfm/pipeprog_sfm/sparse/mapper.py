@@ -134,7 +134,9 @@ class Mapper:
     def take_camera(self, refinement: Refinement) -> None:
         """Goes on with a refined camera: the published model has its poses, all else is adjusted to it."""
         model = self.map.published
-        model.rotation, model.translation = refinement.rotation, refinement.translation
+        for view, stamp in enumerate(model.stamps):
+            pose = refinement.poses[stamp]
+            model.rotation[view], model.translation[view] = pose[:3, :3], pose[:3, 3]
         for stamp, keyframe in self._retired.items():
             self._retired[stamp] = keyframe.with_camera(refinement.camera)
         self.map.replace_camera(refinement.told, refinement.camera)

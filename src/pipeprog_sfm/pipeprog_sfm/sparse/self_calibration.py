@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.errors import InputError
 from pipeprog_sfm.config import CalibrationConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
 from pipeprog_sfm.sparse.model_adjustment import CAUCHY
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
-NAMES = ("focal length", "k1", "k2")
 MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map
 MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera that its depth does not take up
 DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with more, the prior has decided
@@ -47,8 +45,7 @@ class Refinement:
         changes: (3,) of the logarithm of the focal length, of k1 and of k2.
         sigmas: (3,) their standard deviations; infinite for what the data do not determine, which stays as it was.
         shift: the most by which it moves a point of the image, px.
-        rotation: (V, 3, 3) camera_from_model of the views with it.
-        translation: (V, 3).
+        poses: (4, 4) camera_from_model of the views with it, by stamp.
     """
 
     told: Camera
@@ -56,8 +53,7 @@ class Refinement:
     changes: FloatArray
     sigmas: FloatArray
     shift: float
-    rotation: FloatArray
-    translation: FloatArray
+    poses: Mapping[int, FloatArray]
 
     @property
     def is_significant(self) -> bool:
@@ -117,14 +113,8 @@ class _Problem:
         error, turned, rays = self.residuals(state)
         camera = changed(self.camera, state.numbers)
         root = np.sqrt(1.0 / (1.0 + (error**2).sum(axis=1) / CAUCHY**2)) / self.noise
-        by_ray = np.stack([_difference(lambda h, i=i: pixels_of(camera, rays + h * np.eye(2)[i])) for i in (0, 1)], -1)
-        by_number = np.stack(
-            [
-                _difference(lambda h, i=i: pixels_of(changed(self.camera, state.numbers + h * np.eye(3)[i]), rays))
-                for i in range(3)
-            ],
-            axis=-1,
-        )
+        by_ray = _derivatives(lambda step: pixels_of(camera, rays + step), 2)
+        by_number = _derivatives(lambda step: pixels_of(changed(self.camera, state.numbers + step), rays), 3)
         depth = turned[:, 2] + state.translation[self.view, 2]
         slope = np.zeros((len(rays), 2, 3))
         slope[:, 0, 0] = slope[:, 1, 1] = 1.0
@@ -132,7 +122,8 @@ class _Problem:
         by_shift = by_ray @ slope * (root / np.maximum(depth, 1e-9))[:, None, None]
         by_turn = np.cross(turned[:, None, :], by_shift)
         by_point = by_shift @ state.rotation[self.view]
-        columns = np.c_[6 * self.view[:, None] + np.arange(6), np.tile(6 * len(state.rotation) + np.arange(3), (len(rays), 1))]
+        last = np.broadcast_to(6 * len(state.rotation) + np.arange(3), (len(rays), 3))
+        columns = np.c_[6 * self.view[:, None] + np.arange(6), last]
         data = np.concatenate([by_turn, by_shift, by_number * root[:, None, None]], axis=-1)
         rows = np.arange(2 * len(rays)).reshape(-1, 2, 1)
         by_views = scipy.sparse.csr_matrix(
@@ -159,7 +150,7 @@ def refine(
         return None
     prior = np.array([config.focal_sigma, config.distortion_sigma, K2_SHARE * config.distortion_sigma])
     offset = numbers_of(told) - numbers_of(camera)  # the prior's centre, from the camera in use
-    free = np.ones(3, bool)
+    free: NDArray[np.bool_] = np.ones(3, bool)
     while free.any():
         held = np.where(free, prior, 1e-9)
         problem = _Problem(model, camera, chosen, held)
@@ -171,10 +162,11 @@ def refine(
     if not free.any():
         return None
     found = changed(camera, state.numbers)
-    return Refinement(
-        camera, found, state.numbers, np.where(free, sigmas, np.inf), largest_shift(camera, found),
-        state.rotation, state.translation,
-    )  # fmt: skip
+    poses = np.tile(np.eye(4), (len(model), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = state.rotation, state.translation
+    by_stamp = dict(zip(model.stamps, poses, strict=True))
+    kept = np.where(free, sigmas, np.inf)
+    return Refinement(camera, found, state.numbers, kept, largest_shift(camera, found), by_stamp)
 
 
 def numbers_of(camera: Camera) -> FloatArray:
@@ -194,11 +186,6 @@ def changed(camera: Camera, numbers: FloatArray) -> Camera:
 def pixels_of(camera: Camera, rays: FloatArray) -> FloatArray:
     """(K, 2) pixels of the image as it is where the camera shows (K, 2) normalised image coordinates."""
     return camera.distort_points(rays * [camera.fx, camera.fy] + [camera.cx, camera.cy])
-
-
-def converted(pixels: FloatArray, camera: Camera, other: Camera) -> FloatArray:
-    """(N, 2) pixels of a camera's ideal pinhole image -> those of another calibration of the same image."""
-    return other.undistort_points(camera.distort_points(pixels))
 
 
 def largest_shift(camera: Camera, other: Camera) -> float:
@@ -303,9 +290,7 @@ def _eliminated(
     return (normal + scipy.sparse.diags(diagonal) - lifted @ coupling.T).tocsc(), coupling, inverse, lifted
 
 
-def _step(
-    problem: _Problem, rows: _Rows, pull: FloatArray, damping: float
-) -> tuple[FloatArray, FloatArray]:
+def _step(problem: _Problem, rows: _Rows, pull: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
     """Step (6V + 3,) of poses and camera and (P, 3) of the points; pull (3,): the prior's gradient."""
     reduced, coupling, inverse, lifted = _eliminated(problem, rows, damping)
     gradient = -(rows.by_views.T @ rows.residuals)
@@ -336,6 +321,7 @@ def _sigmas(problem: _Problem, rows: _Rows) -> FloatArray:
     return np.sqrt(spread + by_prior.sum(axis=0))
 
 
-def _difference(function: Callable[[float], FloatArray], step: float = STEP) -> FloatArray:
-    """Central difference of a function of one number at zero."""
-    return (function(step) - function(-step)) / (2 * step)
+def _derivatives(function: Callable[[FloatArray], FloatArray], count: int) -> FloatArray:
+    """(K, 2, N) central differences of (K, 2) values by `count` numbers, at zero."""
+    steps = STEP * np.eye(count)
+    return np.stack([(function(step) - function(-step)) / (2 * STEP) for step in steps], axis=-1)

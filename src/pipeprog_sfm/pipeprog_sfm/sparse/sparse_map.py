@@ -15,6 +15,7 @@ from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_points, pose_covariance
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
 from pipeprog_sfm.sparse.registration import rejection_reason
+from pipeprog_sfm.sparse.self_calibration import RADII, radial_residuals
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 ERROR_SAMPLE = 20_000  # observations that give the mean error: with a spread of 1 px, to 1 / sqrt(20 000) = 0.007 px
@@ -116,6 +117,11 @@ class SparseMap:
         features = np.flatnonzero(model.point_of >= 0)
         features = features[:: max(len(features) // ERROR_SAMPLE, 1)]
         return float(model.errors(features).mean()) if len(features) else 0.0
+
+    def radial_residuals(self) -> FloatArray:
+        """As of `self_calibration.radial_residuals`, of the published model; NaN without one."""
+        model = self.published
+        return radial_residuals(model, self.keyframes[model.stamps[0]].camera) if len(model) else np.full(RADII, np.nan)
 
     def covariance(self, stamp: int, gradients: FloatArray) -> FloatArray:
         """(S, S) covariance of functions of the poses of the model that holds a keyframe.

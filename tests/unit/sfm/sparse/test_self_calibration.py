@@ -13,7 +13,7 @@ from pipeprog_sfm.config import CalibrationConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.sparse.model_adjustment import adjust_model
-from pipeprog_sfm.sparse.self_calibration import numbers_of, radial_residuals, refine
+from pipeprog_sfm.sparse.self_calibration import refine
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 TRUE = Camera(848, 480, 600.0, 600.0, 423.5, 239.5, "plumb_bob", (0.0, 0.0, 0.0, 0.0))
