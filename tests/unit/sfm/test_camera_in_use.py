@@ -65,6 +65,6 @@ def test_a_board_that_disagrees_keeps_the_calibration(before: float | None, afte
 def test_residuals_that_grow_with_the_radius_are_said() -> None:
     assert radial_warning(np.full(RADII, 0.03)) == ""
     assert radial_warning(np.full(RADII, np.nan)) == ""
-    text = radial_warning(np.linspace(0, -0.4, RADII))
+    text = radial_warning(np.linspace(0, -0.4, RADII).astype(float))
     assert "to 0.40 px" in text
     assert "calibrate" in text
