@@ -39,6 +39,7 @@ class PlannedState:
         length: how much of it is installed [m].
         across: greatest distance between planned and measured axis [m], 0 where none was found.
         along: by how far it lies further along its axis than planned [m].
+        stretches: of the planned axis, from its start [m], beside which a measured pipe lies.
     """
 
     planned: PlannedPipe
@@ -46,6 +47,7 @@ class PlannedState:
     length: float
     across: float
     along: float
+    stretches: tuple[tuple[float, float], ...] = ()
 
     @property
     def state(self) -> str:
@@ -134,5 +136,6 @@ def _state(planned: PlannedPipe, pairs: Sequence[_Pair], found: Sequence[FoundPi
     at_end = max(pair.on_planned[1] for pair in pairs) - planned.cylinder.length
     along = min(at_start, at_end, key=abs) if at_start * at_end > 0.0 else 0.0
     length = min(sum(pair.beside[1] - pair.beside[0] for pair in pairs), planned.cylinder.length)
-    ids = tuple(found[pair.found].id for pair in sorted(pairs, key=lambda pair: pair.beside))
-    return PlannedState(planned, ids, length, max(pair.across for pair in pairs), along)
+    ordered = sorted(pairs, key=lambda pair: pair.beside)
+    ids, stretches = tuple(found[pair.found].id for pair in ordered), tuple(pair.beside for pair in ordered)
+    return PlannedState(planned, ids, length, max(pair.across for pair in pairs), along, stretches)
