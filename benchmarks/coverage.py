@@ -4,9 +4,9 @@
     .venv/bin/python -m benchmarks.coverage
 
 A third of each site's pipes are planned and not installed, and a third of the others count as missed by the detector.
-The cloud is what rays of the keyframes meet, with the noise of stereo and without the thinnest class, which stereo loses
-before a wall. Each planned pipe is then told as installed, missing, unclear, hidden or not seen, and rays through the
-whole site say what was in view. Writes results/coverage.json.
+The cloud is what rays of the keyframes meet, with the noise of stereo and without the thinnest class, which stereo
+loses before a wall. Each planned pipe is then told as installed, missing, unclear, hidden or not seen, and rays through
+the whole site say what was in view. Writes results/coverage.json.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import json
 import math
 import sys
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +25,9 @@ from benchmarks.survey import RESULTS, commit
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.coverage.planned import PlannedCoverage, planned_coverage
+from pipeprog_detect.coverage.survey import views_of
 from pipeprog_detect.product.boq import PlannedPipe
 from pipeprog_detect.product.installed_where_planned import FoundPipe, installed_where_planned
-from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cylinder, View
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bags"))
@@ -52,13 +51,13 @@ FOUND_SHARE = 0.6  # of a pipe's length in view that the detector is taken to ne
 
 def main() -> None:
     """Print the rows and write results/coverage.json."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for layout in ("lab", "field"):
         for case in ("curtain", "closed door", "leg not walked"):
-            row: Counter[str] = Counter()
+            counts: Counter[str] = Counter()
             for seed in SEEDS:
-                row.update(measured(layout, case, seed))
-            rows.append({"site": layout, "case": case, "seeds": len(SEEDS), **row})
+                counts.update(measured(layout, case, seed))
+            rows.append({"site": layout, "case": case, "seeds": len(SEEDS), **counts})
             print(rows[-1])
     total: Counter[str] = Counter()
     for row in rows:
@@ -160,8 +159,7 @@ def views(site: Site, absent: NDArray[np.bool_], poses: FloatArray) -> list[View
         distance = np.linalg.norm(rays, axis=1)[:, None]
         points.append(pose[:3, 3] + rays * (1 + NOISE / 2.0 * rng.standard_normal((len(rays), 1)) * distance / 2.0))
     camera = Camera(LENS.width, LENS.height, LENS.fx, LENS.fy, LENS.cx, LENS.cy)
-    blank = np.zeros((0, 0), np.uint8)
-    return with_depths([View(k, blank, camera, np.linalg.inv(pose)) for k, pose in enumerate(poses)], np.concatenate(points))
+    return views_of([camera] * len(poses), poses, np.concatenate(points))
 
 
 def _scene(site: Site, absent: NDArray[np.bool_], thinnest: float) -> Scene:

@@ -61,6 +61,14 @@ PAGES = {
         ("fleet_throughput", "fleet_kills", "fleet_kills_stand_in", "fleet_simulated"),
         "What `pipeprog fleet` does and what it costs: [fleet](../fleet.md).",
     ),
+    "coverage": Page(
+        "Seen and not seen",
+        ("coverage",),
+        "A third of the pipes are planned and not installed, and a third of the others count as missed by the detector."
+        "\nThe cloud is what rays of the keyframes meet, with the noise of stereo and without the thinnest class.\n"
+        "Out of sight is a pipe of which three keyframes see at most a tenth, in view one of which they see nine "
+        "tenths; rightly told as missing can only be pipes thicker than 20 mm in radius.",
+    ),
     "board_views": Page(
         "Experiment 1: the scale from few views of the board",
         ("board_views",),

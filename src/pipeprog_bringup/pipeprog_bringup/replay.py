@@ -17,7 +17,7 @@ from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph
 from pipeprog_bringup.playback.private_network import private_network
 from pipeprog_bringup.playback.scratch import check_room, scratch_folder
 from pipeprog_bringup.playback.session import Session, State
-from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, write_survey
+from pipeprog_bringup.playback.survey_writer import coverage_of, record_keyframes, record_survey, write_survey
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.recording_check import faults_of
@@ -91,9 +91,10 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
         with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
             recording.describe(_described(request))
             record_survey(recording, survey, status)
-            record_keyframes(recording, inputs.bag, session.log, survey)
+            cameras = record_keyframes(recording, inputs.bag, session.log, survey)
         started = time.monotonic()
-        product = write_survey(folder, survey, session.log, request.with_cloud)
+        coverage = coverage_of(survey, cameras, inputs.boq.pipes)
+        product = write_survey(folder, survey, session.log, coverage, request.with_cloud)
         points = points_from_cloud(survey.cloud)[0]
         outcome = Outcome(
             product=product,

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Transform, TransformStamped, Vector3
 from rclpy.serialization import deserialize_message, serialize_message
@@ -18,6 +20,9 @@ from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import write_las, write_ply
+from pipeprog_camera.camera import Camera
+from pipeprog_detect.coverage.survey import SurveyCoverage, survey_coverage, views_of
+from pipeprog_detect.product.boq import PlannedPipe
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun
 from pipeprog_detect.product.product import Product
@@ -28,12 +33,14 @@ from pipeprog_node import messages
 _SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}
 
 
-def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog, with_cloud: bool) -> Product:
+def write_survey(
+    folder: OutputFolder, survey: LastMessages, log: FrameLog, coverage: SurveyCoverage, with_cloud: bool
+) -> Product:
     """Write pipes.json, progress.csv, trajectory.tum, frames.csv, cloud.ply and .las if wanted; returns the product."""
     product = product_from_msg(survey.pipes)
     scale = result_files.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
-    result_files.write_pipes(folder.file("pipes.json"), product, scale)
-    result_files.write_progress(folder.file("progress.csv"), product)
+    result_files.write_pipes(folder.file("pipes.json"), product, scale, coverage)
+    result_files.write_progress(folder.file("progress.csv"), product, coverage)
     if with_cloud:
         points, normals = messages.points_from_cloud(survey.cloud)
         colors = messages.colors_from_cloud(survey.cloud)
@@ -50,6 +57,16 @@ def write_survey(folder: OutputFolder, survey: LastMessages, log: FrameLog, with
     return product
 
 
+def coverage_of(survey: LastMessages, cameras: Mapping[int, Camera], planned: Sequence[PlannedPipe]) -> SurveyCoverage:
+    """What the keyframes had in view, whose cameras are given by stamp; `planned` are the pipes that have places."""
+    product = product_from_msg(survey.pipes)
+    points = messages.points_from_cloud(survey.cloud)[0].astype(float)
+    stamps, poses = messages.poses_from_path(survey.poses)
+    kept = [row for row, stamp in enumerate(stamps.tolist()) if stamp in cameras]
+    views = views_of([cameras[int(stamps[row])] for row in kept], poses[kept], points)
+    return survey_coverage(product.pipes, planned, [entry.outer_radius for entry in product.classes], points, views)
+
+
 def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmStatus) -> None:
     """Write the results into out.mcap, at the time of the first keyframe: a viewer shows them from the start."""
     stamp = messages.stamp_ns(survey.poses.poses[0].header.stamp)
@@ -58,8 +75,12 @@ def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmSta
         recording.write(f"/{topic}", _type_name(type(message)), serialize_message(message), stamp, latched=True)
 
 
-def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: LastMessages) -> None:
-    """Write the keyframes into out.mcap, each with the calibration that was used and its camera's transform."""
+def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: LastMessages) -> dict[int, Camera]:
+    """Write the keyframes into out.mcap, each with the calibration that was used and its camera's transform.
+
+    Returns their cameras by stamp.
+    """
+    cameras = {}
     places = {messages.stamp_ns(place.header.stamp): place for place in survey.poses.poses}
     refined = None if survey.refined is None else messages.camera_from_info(survey.refined)
     chosen = {row.stamp for row in log.rows() if row.chosen}
@@ -73,11 +94,13 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: Last
             data = cdr.write_compressed_image(frame.stamp, frame.frame_id, "jpeg", encoded)
         used = messages.info_from_camera(refined, frame.stamp, frame.frame_id) if refined else calibration(frame)
         info = serialize_message(used)
+        cameras[frame.stamp] = cdr.read_camera_info(info).camera()
         recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, info, frame.stamp)
         recording.write("/keyframes/image/compressed", cdr.COMPRESSED_IMAGE, data, frame.stamp)
         if frame.stamp in places:
             moved = _transform(places[frame.stamp], frame.frame_id)
             recording.write("/tf", cdr.TF, serialize_message(moved), frame.stamp)
+    return cameras
 
 
 def _transform(place: PoseStamped, camera: str) -> TFMessage:

@@ -12,15 +12,20 @@ from pipeprog_camera.json_file import read_json
 from pipeprog_camera.limits import MAX_CLASSES, MAX_COORDINATE, MAX_PIPES
 from pipeprog_camera.outside_text import name_of, shown
 
+# Metres that were not found, by what the keyframes tell of their places.
+COVERAGE_KEYS = ("missing_m", "unclear_m", "hidden_m", "not_seen_m")
+
 
 @dataclass(frozen=True)
 class PipesFile:
-    """Content of a pipes.json: rows as the file has them."""
+    """Content of a pipes.json: rows as the file has them; `walls_m2` is None where no coverage is told."""
 
     pipes: list[dict[str, Any]]
     classes: list[dict[str, Any]]
     runs: list[dict[str, Any]]
     scale: dict[str, Any]
+    planned: list[dict[str, Any]]
+    walls_m2: float | None
 
 
 def read_pipes(path: Path) -> PipesFile:
@@ -32,14 +37,18 @@ def read_pipes(path: Path) -> PipesFile:
             classes=rows_of(content, "classes", MAX_CLASSES),
             runs=rows_of({"runs": [], **content}, "runs", MAX_PIPES),
             scale=_scale(content.get("scale", {})),
+            planned=rows_of({"planned": [], **content}, "planned", MAX_PIPES),
+            walls_m2=number(content, "walls_m2", "the survey") if content.get("walls_m2") is not None else None,
         )
-        for number, entry in enumerate(file.classes, 1):
-            _check_class(entry, f"class {number}")
+        for place, entry in enumerate(file.classes, 1):
+            _check_class(entry, f"class {place}")
+        for place, row in enumerate(file.planned, 1):
+            _check_planned(row, f"planned pipe {place}")
         names = {entry["class"] for entry in file.classes}
-        for number, pipe in enumerate(file.pipes, 1):
-            _check_pipe(pipe, f"pipe {number}")
+        for place, pipe in enumerate(file.pipes, 1):
+            _check_pipe(pipe, f"pipe {place}")
             if pipe["class"] is not None and pipe["class"] not in names:
-                raise InputError(f"class {shown(pipe['class'])} of pipe {number} is not among its classes")
+                raise InputError(f"class {shown(pipe['class'])} of pipe {place} is not among its classes")
     except InputError as error:
         raise InputError(f"{path} is no pipes.json of pipeprog ({error}): run `pipeprog replay` again") from None
     return file
@@ -88,8 +97,9 @@ def _scale(value: Any) -> dict[str, Any]:
 def _check_class(entry: dict[str, Any], where: str) -> None:
     for key in ("outer_radius", "planned_m", "installed_m"):
         number(entry, key, where)
-    if entry.get("installed_sigma_m") is not None:
-        number(entry, "installed_sigma_m", where)
+    for key in ("installed_sigma_m", *COVERAGE_KEYS, "walls_seen_percent"):
+        if entry.get(key) is not None:
+            number(entry, key, where)
     if not isinstance(entry.get("class"), str):
         raise InputError(f"class of {where} is {shown(entry.get('class'))}, not a name")
     name_of(entry["class"], f"the name of {where}")
@@ -103,7 +113,7 @@ def _check_pipe(pipe: dict[str, Any], where: str) -> None:
     for key in ("radius_sigma", "rmse"):
         if pipe.get(key) is not None or key not in pipe:
             number(pipe, key, where)
-    for key in ("class_probability", "visible_arc_deg", "points", "length_sigma"):
+    for key in ("class_probability", "visible_arc_deg", "points", "length_sigma", "hidden_m", "not_seen_m"):
         if pipe.get(key) is not None:
             number(pipe, key, where)
     if not isinstance(pipe.get("id"), str):
@@ -116,6 +126,14 @@ def _check_pipe(pipe: dict[str, Any], where: str) -> None:
     for key in ("class", "class_kmeans"):
         if pipe.get(key) is not None and not isinstance(pipe[key], str):
             raise InputError(f"{key} of {where} is {shown(pipe[key])}, not a name")
+
+
+def _check_planned(row: dict[str, Any], where: str) -> None:
+    for key in ("id", "name", "class", "state"):
+        if not isinstance(row.get(key), str):
+            raise InputError(f"{key} of {where} is {shown(row.get(key))}, not a text")
+    for key in ("planned_m", "installed_m", *COVERAGE_KEYS):
+        number(row, key, where)
 
 
 def _check_end(row: dict[str, Any], where: str) -> None:

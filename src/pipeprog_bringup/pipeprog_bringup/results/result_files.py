@@ -18,13 +18,16 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from pipeprog_bringup.results import coverage_fields
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_TABLE
 from pipeprog_camera.outside_text import for_spreadsheet, shown
 from pipeprog_camera.text_file import read_text
+from pipeprog_detect.coverage.survey import SurveyCoverage
 from pipeprog_detect.product.boq import BillLine, BillOfQuantities, PipeClass
+from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import PipeRun
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Pipe
@@ -64,24 +67,26 @@ class FrameRow:
     tie_points: int | None = None
 
 
-def write_pipes(path: Path, product: Product, scale: Scale) -> None:
+def write_pipes(path: Path, product: Product, scale: Scale, coverage: SurveyCoverage | None = None) -> None:
     """pipes.json, one line a pipe; lengths rounded to the micrometre, far below the error of any measurement."""
-    head = {"frame_id": "map", "scale": {"source": scale.source, "sigma": _significant(scale.sigma)}}
+    head: dict[str, Any] = {
+        "frame_id": "map",
+        "scale": {"source": scale.source, "sigma": _significant(scale.sigma)},
+    }
     rows = {
         "pipes": [_pipe_entry(pipe, product) for pipe in product.pipes],
-        "classes": [
-            {
-                "class": entry.name,
-                "outer_radius": round(entry.outer_radius, 6),
-                "planned_m": round(entry.planned, 6),
-                "installed_m": round(entry.installed, 6),
-                "percent": round(entry.percent, 2),
-                "installed_sigma_m": _significant(product.installed_sigma(entry.name)),
-            }
-            for entry in product.classes
-        ],
+        "classes": [_class_entry(entry, product) for entry in product.classes],
         "runs": [_run_entry(run) for run in product.runs],
     }
+    if coverage is not None:
+        head["walls_m2"] = round(coverage.walls.area, 1)
+        for row, own in zip(rows["pipes"], coverage.pipes, strict=True):
+            row |= coverage_fields.of_pipe(own)
+        names = [entry.name for entry in product.classes]
+        for row, fields in zip(rows["classes"], coverage_fields.of_classes(names, coverage), strict=True):
+            row |= fields
+        if coverage.planned:
+            rows["planned"] = [coverage_fields.of_planned(each) for each in coverage.planned]
     parts = [json.dumps(head, allow_nan=False)[1:-1]]
     for name, entries in rows.items():
         lines = ",\n  ".join(json.dumps(entry, allow_nan=False) for entry in entries)
@@ -89,18 +94,23 @@ def write_pipes(path: Path, product: Product, scale: Scale) -> None:
     path.write_text("{" + ",\n ".join(parts) + "}\n")
 
 
-def write_progress(path: Path, product: Product) -> None:
+def write_progress(path: Path, product: Product, coverage: SurveyCoverage | None = None) -> None:
     """progress.csv: one line a class, for a spreadsheet."""
+    names = [entry.name for entry in product.classes]
+    seen: list[dict[str, float | None]] = [{} for _ in names]
+    if coverage is not None:
+        seen = coverage_fields.of_classes(names, coverage)
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(
-            ["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes", "installed_sigma_m"]
-        )
-        for entry in product.classes:
+        columns = ["class", "outer_radius_mm", "planned_m", "installed_m", "percent", "pipes", "installed_sigma_m"]
+        told = coverage_fields.CLASS_FIELDS if coverage is not None else ()
+        writer.writerow([*columns, *told])
+        for entry, own in zip(product.classes, seen, strict=True):
             count = sum(pipe.class_name == entry.name for pipe in product.pipes)
             lengths = [f"{entry.planned:.3f}", f"{entry.installed:.3f}", f"{entry.percent:.1f}"]
             sigma = product.installed_sigma(entry.name)
             cells = [f"{1e3 * entry.outer_radius:.2f}", *lengths, count, f"{sigma:.4f}" if np.isfinite(sigma) else ""]
+            cells += ["" if own[key] is None else f"{own[key]:g}" for key in told]
             writer.writerow([for_spreadsheet(entry.name), *cells])
 
 
@@ -236,6 +246,17 @@ def _pipe_entry(pipe: Pipe, product: Product) -> dict[str, Any]:
         "points": int(pipe.points),
         "length_sigma": _significant(product.length_sigma(pipe)),
         "ends": [{"state": end.state, "sigma": _significant(end.sigma)} for end in pipe.ends],
+    }
+
+
+def _class_entry(entry: ClassProgress, product: Product) -> dict[str, Any]:
+    return {
+        "class": entry.name,
+        "outer_radius": round(entry.outer_radius, 6),
+        "planned_m": round(entry.planned, 6),
+        "installed_m": round(entry.installed, 6),
+        "percent": round(entry.percent, 2),
+        "installed_sigma_m": _significant(product.installed_sigma(entry.name)),
     }
 
 

@@ -49,6 +49,8 @@ class Results:
         pipes: rows of pipes.json, one a pipe, with its fields: `id`, `start`, `end`, `radius` [m], `class`, ...
         classes: rows of pipes.json, one a planned class: `class`, `planned_m`, `installed_m`, `percent`, ...
         runs: rows of pipes.json, one for each set of pipes that fittings connect.
+        planned: rows of pipes.json, one a planned pipe; empty where the plan has no places.
+        walls_m2: area of the walls that were found; None where no coverage is told.
         scale: where the metres come from, `source` and relative `sigma`.
         facts: run.json, how the run went.
         config: config.yaml, the settings in force and the bill of quantities.
@@ -60,6 +62,8 @@ class Results:
     pipes: list[dict[str, Any]]
     classes: list[dict[str, Any]]
     runs: list[dict[str, Any]]
+    planned: list[dict[str, Any]]
+    walls_m2: float | None
     scale: dict[str, Any]
     facts: dict[str, Any]
     config: dict[str, Any]
@@ -132,6 +136,8 @@ def read_results(folder: str | Path) -> Results:
         pipes=file.pipes,
         classes=file.classes,
         runs=file.runs,
+        planned=file.planned,
+        walls_m2=file.walls_m2,
         scale=file.scale,
         facts=_facts(_mapping(folder / "run.json", read_json)),
         config=_mapping(folder / "config.yaml", read_yaml),

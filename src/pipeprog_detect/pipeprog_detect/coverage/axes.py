@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.coverage.places import Sight, sights
 from pipeprog_detect.types import Cylinder, View
 
@@ -28,9 +29,9 @@ class AxisCoverage:
         chosen = np.isin(self.parts, wanted)
         return float((chosen if within is None else chosen & within).mean()) * self.length
 
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> FloatArray:
         """Middles (N,) of the parts along the axis, from its start [m]."""
-        return (np.arange(len(self.parts)) + 0.5) * (self.length / len(self.parts))
+        return np.asarray((np.arange(len(self.parts)) + 0.5) * (self.length / len(self.parts)), np.float64)
 
 
 def axis_coverage(cylinders: Sequence[Cylinder], views: Sequence[View]) -> list[AxisCoverage]:
