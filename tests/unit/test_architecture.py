@@ -54,6 +54,7 @@ FOLDERS = {
         "product": {"plan"},
         "verification": {"cloud", "silhouette", "product"},
         "thin": {"cloud", "silhouette", "product", "verification"},
+        "coverage": {"cloud", "silhouette", "product", "thin"},
     },
     "pipeprog_bringup": {
         "recording": set(),
@@ -61,13 +62,14 @@ FOLDERS = {
         "footage": set(),
         "results": {"clouds"},
         "export": {"recording", "results"},
-        "report": {"recording", "results"},
+        "comparison": {"recording", "results"},
+        "report": {"recording", "results", "comparison"},
         "view": {"report", "results"},
         "fleet": {"report", "results"},
         "playback": {"recording", "results"},
         "commands": {  # as thin as they are, they stand above all
             *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
-            *("console", "footage", "plane_from_keyframe", "recording", "recording_check"),
+            *("console", "footage", "plane_from_keyframe", "recording", "recording_check", "comparison"),
         },
     },
 }

@@ -16,6 +16,7 @@ import typer
 
 from pipeprog_bringup.commands.board import board
 from pipeprog_bringup.commands.check import check
+from pipeprog_bringup.commands.compare import compare
 from pipeprog_bringup.commands.detect import detect
 from pipeprog_bringup.commands.export import export
 from pipeprog_bringup.commands.fleet import fleet
@@ -38,7 +39,7 @@ app = typer.Typer(
 for panel, commands in {
     "From recordings": (check, replay, fleet, detect),
     "To recordings": (ingest, board),
-    "From results": (score, report, view, export),
+    "From results": (score, report, compare, view, export),
 }.items():
     for command in commands:
         app.command(rich_help_panel=panel)(command)

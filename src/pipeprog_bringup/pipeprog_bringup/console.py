@@ -18,6 +18,7 @@ from rich.text import Text
 from pipeprog_camera.outside_text import for_terminal
 
 if TYPE_CHECKING:
+    from pipeprog_bringup.comparison.comparison import Step
     from pipeprog_bringup.fleet.task import Outcome
     from pipeprog_bringup.playback.session import State
     from pipeprog_detect.product.product import Product
@@ -188,6 +189,24 @@ def print_progress(product: Product) -> None:
         total = sum(pipe.cylinder.length for pipe in others)
         table.add_row("[dim]no planned class", "", str(len(others)), f"{total:.2f}", "", "", "")
     output_console().print(table)
+
+
+def print_steps(steps: Sequence[Step]) -> None:
+    """What became of each pipe, one table a step from survey to survey."""
+    for step in steps:
+        table = Table(title=f"{_name(step.earlier)} to {_name(step.later)}", title_justify="left")
+        for name in ("pipe", "class", "state"):
+            table.add_column(name)
+        for name in ("before [m]", "now [m]", "counts [m]"):
+            table.add_column(name, justify="right")
+        for each in step.pipes:
+            change = each.change
+            lengths = (change.length_before, change.length_after, change.counted)
+            state = change.state.replace("_", " ")
+            table.add_row(
+                each.life, _name(change.class_name or "no planned class"), state, *(f"{m:.2f}" for m in lengths)
+            )
+        output_console().print(table)
 
 
 def print_score(figures: dict[str, Any]) -> None:

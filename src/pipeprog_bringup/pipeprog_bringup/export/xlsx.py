@@ -71,6 +71,7 @@ _NOT_SEEN = (
     *(_Column(f"{end} {axis} [m]", _METRES) for end in ("Start", "End") for axis in "xyz"),
     _Column("GUID in the plan", width=26),
 )
+_HIDDEN = (_Column("Hidden [m]", _METRES), _Column("Out of view [m]", _METRES, 15))
 # Field names of Primavera P6's spreadsheets, which take the first row, and the captions in the second.
 _TASK = (_Column("task_code", width=20), _Column("phys_complete_pct", "0.0", 20))
 _TASK_CAPTIONS = ("Activity ID", "Physical % Complete")
@@ -95,8 +96,7 @@ def write_xlsx(survey: Survey, path: Path) -> None:
     _write_sheet(book, "Pipes", _PIPES, [_pipe_row(pipe) for pipe in survey.pipes])
     if survey.planned:
         _write_sheet(book, "Planned", _PLANNED, [_planned_row(state) for state in survey.planned])
-        missing = [_not_seen_row(state.planned) for state in survey.planned if not state.found]
-        _write_sheet(book, "Not seen", _NOT_SEEN, missing)
+        _write_sheet(book, "Not seen", *_not_seen(survey))
     shares = activity_shares(survey)
     if shares:
         rows: list[list[Any]] = [[name, 100.0 * share] for name, share in sorted(shares.items())]
@@ -145,6 +145,19 @@ def _planned_row(state: PlannedState) -> list[Any]:
     off: list[float | None] = [1e3 * state.across, 1e3 * state.along] if state.found else [None] * 2
     cells = [planned.name, planned.class_name, state.state, planned.cylinder.length, state.length, *off]
     return [*cells, ", ".join(state.found), planned.id]
+
+
+def _not_seen(survey: Survey) -> tuple[Sequence[_Column], list[list[Any]]]:
+    """Columns and rows of the planned pipes that were not seen whole; without a coverage, of those not found."""
+    coverage = {row["id"]: row for row in survey.results.planned}
+    if not coverage:
+        return _NOT_SEEN, [_not_seen_row(state.planned) for state in survey.planned if not state.found]
+    rows = []
+    for state in survey.planned:
+        own = coverage.get(state.planned.id)
+        if own is not None and own["hidden_m"] + own["not_seen_m"] > 0:
+            rows.append([*_not_seen_row(state.planned), own["hidden_m"], own["not_seen_m"]])
+    return (*_NOT_SEEN, *_HIDDEN), rows
 
 
 def _not_seen_row(planned: PlannedPipe) -> list[Any]:

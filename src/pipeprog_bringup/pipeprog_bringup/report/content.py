@@ -12,11 +12,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from sklearn.metrics import confusion_matrix
 
+from pipeprog_bringup.comparison.comparison import LifeChange, OtherSiteError, Step, compare
 from pipeprog_bringup.report import drawings, plots, render, viewer_data
 from pipeprog_bringup.report.photographs import Photograph, photographs
 from pipeprog_bringup.report.summary import Summary, summary
 from pipeprog_bringup.report.survey_reader import Survey
 from pipeprog_bringup.results.results_reader import Color
+from pipeprog_camera.errors import InputError
+from pipeprog_detect.coverage.changes import Change
 
 STILL_WIDTH = 1000  # px: the width of the page
 STILL_QUALITY = 85  # of the JPEG
@@ -28,7 +31,10 @@ HIDING_POINTS = 100_000  # of the cloud, to find what hides a pipe: one for each
 
 @dataclass(frozen=True)
 class PipeRow:
-    """A pipe as the report lists it: its row of pipes.json, letter and colour of its class, run, ends, photographs."""
+    """A pipe as the report lists it: its row of pipes.json, letter and colour of its class, run, ends, photographs.
+
+    `change`: what became of it since the survey before, empty where nothing is to be told.
+    """
 
     row: dict[str, Any]
     letter: str
@@ -36,6 +42,7 @@ class PipeRow:
     run: str
     fittings: list[str]
     ends: str
+    change: str
     photographs: list[Photograph]
 
 
@@ -46,6 +53,7 @@ class Content:
     Attributes:
         surveys: all, in the order of their dates; the last is shown in full.
         summary: the answer and the table of classes.
+        changes: what became of each pipe since the survey before, but for those that were kept; empty for one survey.
         facts: terms and values on how the survey went.
         pipes: all pipes.
         no_photographs: why there are none, empty where there are.
@@ -56,6 +64,7 @@ class Content:
 
     surveys: Sequence[Survey]
     summary: Summary
+    changes: list[LifeChange]
     facts: list[tuple[str, str]]
     pipes: list[PipeRow]
     no_photographs: str
@@ -92,6 +101,7 @@ class Content:
 def gather(surveys: Sequence[Survey], show: Callable[[float, str], None]) -> Content:
     """What to show about these surveys, which are in the order of their dates."""
     newest = surveys[-1]
+    step, not_compared = _last_step(surveys)
     show(0.05, "cloud")
     cloud = viewer_data.thinned(newest, AROUND_PIPES)
     show(0.25, "photographs")
@@ -99,12 +109,14 @@ def gather(surveys: Sequence[Survey], show: Callable[[float, str], None]) -> Con
     sparse = cloud.points[:: max(1, len(cloud.points) // HIDING_POINTS)]
     proofs, no_photographs = photographs(newest.results, sparse, colors)
     show(0.6, "pictures of the cloud")
-    answer = summary(surveys)
+    answer = summary(surveys, step, not_compared)
+    changes = {} if step is None else {name: each for each in step.pipes for name in each.change.after}
     letters = {row.name: row.letter for row in answer.rows}
     runs, fittings = _runs(newest)
     return Content(
         surveys=surveys,
         summary=answer,
+        changes=[] if step is None else [each for each in step.pipes if each.change.state != "kept"],
         facts=_facts(newest),
         pipes=[
             PipeRow(
@@ -114,6 +126,7 @@ def gather(surveys: Sequence[Survey], show: Callable[[float, str], None]) -> Con
                 runs.get(pipe["id"], ""),
                 fittings.get(pipe["id"], []),
                 _ends(pipe),
+                change_words(changes[pipe["id"]].change) if pipe["id"] in changes else "",
                 own,
             )
             for pipe, color, own in zip(newest.pipes, colors, proofs, strict=True)
@@ -122,6 +135,30 @@ def gather(surveys: Sequence[Survey], show: Callable[[float, str], None]) -> Con
         left_out=_left_out(newest),
         stills=_stills(newest),
         cloud=cloud,
+    )
+
+
+def _last_step(surveys: Sequence[Survey]) -> tuple[Step | None, str]:
+    """The step to the last survey, None where there is none, and why surveys cannot be compared.
+
+    Raises OtherSiteError where surveys are not of one site.
+    """
+    if len(surveys) < 2:
+        return None, ""
+    try:
+        return compare([survey.results for survey in surveys])[-1], ""
+    except OtherSiteError:
+        raise
+    except InputError as error:
+        return None, str(error)
+
+
+def change_words(change: Change) -> str:
+    """What became of a pipe, in words."""
+    if change.state in ("longer", "shorter"):
+        return f"{change.state} by {abs(change.counted - change.length_before):.2f} m"
+    return {"not_seen": "not seen this time", "gone": "gone, its place was seen", "kept": "as before"}.get(
+        change.state, change.state
     )
 
 

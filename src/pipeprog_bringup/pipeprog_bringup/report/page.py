@@ -12,10 +12,10 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined, Template
 
 from pipeprog_bringup.report import plots, viewer_data
-from pipeprog_bringup.report.content import Content, gather, kmeans_matrix
+from pipeprog_bringup.report.content import Content, change_words, gather, kmeans_matrix
 from pipeprog_bringup.report.paper import browser, print_page
 from pipeprog_bringup.report.summary import metres, with_sigma
-from pipeprog_bringup.report.survey_reader import Survey, read_survey
+from pipeprog_bringup.report.survey_reader import Survey, read_surveys
 from pipeprog_bringup.results.atomic_output import output_file
 from pipeprog_bringup.results.results_reader import UNPLANNED, Color
 from pipeprog_camera.errors import InputError
@@ -27,16 +27,14 @@ def report(
     """Write the page about the runs in `folders`, the newest in full, and with `pdf` its print beside it.
 
     `out` is an .html file, or a folder that gets a report.html. Returns the page's file. Raises InputError where a
-    folder holds no results.
+    folder holds no results, or where two are surveys of different sites.
     """
     target = out / "report.html" if out.is_dir() or not out.suffix else out
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out {out}: the report is a page, name it .html")
-    if len({folder.resolve() for folder in folders}) < len(folders):
-        raise InputError("a folder is given twice: give each survey once")
+    surveys = read_surveys(folders)
     if pdf:
         browser()
-    surveys = sorted((read_survey(folder) for folder in folders), key=lambda survey: (survey.time, survey.name))
     content = gather(surveys, show)
     show(0.8, "page")
     with output_file(target, force) as temporary:
@@ -83,7 +81,7 @@ def _template() -> Template:
         autoescape=True, undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(css=_css, jpeg=_jpeg, metres=metres)
-    environment.globals.update(with_sigma=with_sigma)
+    environment.globals.update(with_sigma=with_sigma, change_words=change_words)
     return environment.from_string(_own("page.html"))
 
 

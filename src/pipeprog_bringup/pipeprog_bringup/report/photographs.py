@@ -218,7 +218,7 @@ def _cropped(
 
 
 def _longest_side(count: int) -> int:
-    """Longer side [px] of photographs of 3 : 4, so many that they take ALL_PHOTOGRAPHS bytes together at most."""
+    """Longer side [px] at which `count` photographs of 3 : 4 take ALL_PHOTOGRAPHS bytes together at most."""
     area = ALL_PHOTOGRAPHS / BYTES_PER_PIXEL / max(count, 1)
     return min(LONGEST, int(math.sqrt(area / 0.75)))
 

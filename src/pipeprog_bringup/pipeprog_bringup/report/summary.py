@@ -9,15 +9,23 @@ from dataclasses import dataclass
 from string import ascii_uppercase
 from typing import Any
 
+from pipeprog_bringup.comparison.comparison import Step
 from pipeprog_bringup.report.survey_reader import Survey
 from pipeprog_bringup.results.results_reader import Color
 
 DAY = 86_400.0  # s
+# Less of the walls seen is warned of [%]: what is not seen may then hold more than a week's progress, a fifth.
+LEAST_SEEN = 80.0
 
 
 @dataclass(frozen=True)
 class ClassRow:
-    """A planned class: its letter, which stands beside its colour, and its metres; None where not known."""
+    """A planned class: its letter, which stands beside its colour, and its metres; None where not known.
+
+    `unseen`: of the installed metres, those of earlier surveys that the last one has not seen, and not seen to be gone.
+    `not_seen`: planned metres that were hidden or out of view. `walls_seen`: share of the walls' area where a pipe of
+    this class would have been seen [%].
+    """
 
     name: str
     letter: str
@@ -28,6 +36,9 @@ class ClassRow:
     installed: float
     sigma: float | None
     change: float | None
+    unseen: float
+    not_seen: float | None
+    walls_seen: float | None
 
     @property
     def percent(self) -> float:
@@ -45,6 +56,7 @@ class Summary:
         previous: date of the survey before.
         rows: the planned classes.
         unplanned: number of pipes of no planned class, and their metres.
+        seen: what was not seen, as a sentence; empty where the results do not tell.
         warnings: what to doubt, one sentence each.
     """
 
@@ -56,6 +68,7 @@ class Summary:
     previous: str
     rows: list[ClassRow]
     unplanned: tuple[int, float]
+    seen: str
     warnings: list[str]
 
     @property
@@ -81,10 +94,14 @@ class Summary:
         return amount if not self.days else f"{amount}: {self.change / self.days:.2f} m a day"
 
 
-def summary(surveys: Sequence[Survey]) -> Summary:
-    """The answer of the last of these surveys, which are in the order of their dates."""
+def summary(surveys: Sequence[Survey], step: Step | None = None, not_compared: str = "") -> Summary:
+    """The answer of the last of these surveys, which are in the order of their dates.
+
+    `step`: from the survey before, pipe by pipe, and `not_compared` why there is none. With it, what the last survey
+    has not seen is still installed; without, the metres of both are compared.
+    """
     newest, previous = surveys[-1], surveys[-2] if len(surveys) > 1 else None
-    rows = [_row(number, newest, previous, entry) for number, entry in enumerate(newest.classes)]
+    rows = [_row(number, newest, previous, entry, step) for number, entry in enumerate(newest.classes)]
     unplanned = [float(pipe["length"]) for pipe in newest.pipes if pipe["class"] is None]
     changes = [row.change for row in rows if row.change is not None]
     return Summary(
@@ -96,7 +113,9 @@ def summary(surveys: Sequence[Survey]) -> Summary:
         previous="" if previous is None else f"{previous.time:%Y-%m-%d}",
         rows=rows,
         unplanned=(len(unplanned), sum(unplanned)),
-        warnings=_warnings(newest, rows),
+        seen=_seen(newest),
+        warnings=_warnings(newest, rows)
+        + ([f"Metres are compared, not pipes: {not_compared}"] if not_compared else []),
     )
 
 
@@ -127,9 +146,13 @@ def _percent(installed: float, planned: float) -> float:
     return 100 * installed / planned if planned > 0 else 0.0
 
 
-def _row(number: int, newest: Survey, previous: Survey | None, entry: dict[str, Any]) -> ClassRow:
+def _row(number: int, newest: Survey, previous: Survey | None, entry: dict[str, Any], step: Step | None) -> ClassRow:
     name, installed = str(entry["class"]), float(entry["installed_m"])
     before = None if previous is None else previous.installed.get(name)
+    change = None if before is None else installed - before
+    unseen = 0.0
+    if step is not None:
+        change, unseen = step.grown(name), step.unseen(name)
     return ClassRow(
         name=name,
         letter=letter(number),
@@ -137,9 +160,38 @@ def _row(number: int, newest: Survey, previous: Survey | None, entry: dict[str, 
         outer_radius=float(entry["outer_radius"]),
         pipes=sum(pipe["class"] == name for pipe in newest.pipes),
         planned=float(entry["planned_m"]),
-        installed=installed,
+        installed=installed + unseen,
         sigma=entry.get("installed_sigma_m"),
-        change=None if before is None else installed - before,
+        change=change,
+        unseen=unseen,
+        not_seen=_sum_of([entry], "hidden_m", "not_seen_m"),
+        walls_seen=entry.get("walls_seen_percent"),
+    )
+
+
+def _sum_of(entries: Sequence[dict[str, Any]], *keys: str) -> float | None:
+    """Sum of these fields of classes, None where one is not known."""
+    values = [entry.get(key) for entry in entries for key in keys]
+    return None if not values or None in values else sum(float(value or 0.0) for value in values)
+
+
+def _seen(survey: Survey) -> str:
+    """Metres that were not seen; where the plan has no places, how much of the walls was."""
+    hidden, out_of_view = _sum_of(survey.classes, "hidden_m"), _sum_of(survey.classes, "not_seen_m")
+    missing, unclear = _sum_of(survey.classes, "missing_m"), _sum_of(survey.classes, "unclear_m")
+    if hidden is not None and out_of_view is not None:
+        told = f"{metres(hidden + out_of_view)} m were not seen"
+        if hidden + out_of_view > 0:
+            told += f" ({metres(hidden)} m hidden, {metres(out_of_view)} m out of view)"
+        told += f"; {metres(missing or 0.0)} m were looked for and are not there"
+        return told if not unclear else f"{told}; of {metres(unclear)} m it cannot be told"
+    shares = [float(share) for entry in survey.classes if (share := entry.get("walls_seen_percent")) is not None]
+    if not shares or not survey.results.walls_m2:
+        return ""
+    range_of = f"{min(shares):.0f}" if max(shares) - min(shares) < 1 else f"{min(shares):.0f} to {max(shares):.0f}"
+    return (
+        f"{range_of} % of the {survey.results.walls_m2:.0f} m² of walls that were found was seen well enough; "
+        "the plan has no places, so metres that were not seen cannot be told"
     )
 
 
@@ -162,6 +214,18 @@ def _warnings(survey: Survey, rows: Sequence[ClassRow]) -> list[str]:
             f"{keyframes - registered} of {keyframes} keyframes have no place in the map: what only they show is "
             "not measured"
         )
+    unseen = sum(row.unseen for row in rows)
+    if unseen > 0.005:
+        warnings.append(
+            f"{metres(unseen)} m of those installed were measured earlier and were not in view this time: they count on"
+        )
+    thin = [row for row in rows if row.walls_seen is not None and row.walls_seen < LEAST_SEEN]
+    if thin:
+        told = ", ".join(f"{row.name} ({row.walls_seen:.0f} % of the walls)" for row in thin)
+        warnings.append(f"Thin coverage: pipes would have been seen on a part of the walls only: {told}")
+    in_bag, considered = facts.get("frames_in_bag"), facts.get("frames_considered")
+    if in_bag and considered is not None and considered < in_bag:
+        warnings.append(f"The survey stopped early: {considered} of {in_bag} images were worked off")
     if source == "odometry":
         warnings.append("The scale comes from odometry alone: put up a target board to check it")
     if source == "cloud":

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cached_property
@@ -13,6 +14,7 @@ import numpy as np
 
 from pipeprog_bringup.results.results_reader import UNPLANNED, Color, Results, read_results
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.errors import InputError
 from pipeprog_detect.types import Cylinder
 
 # Stamps before this count from some other zero than 1970 (a video, a simulation).
@@ -76,6 +78,13 @@ def read_survey(folder: Path) -> Survey:
     """The results of one run; only pipes.json must be there."""
     results = read_results(folder)
     return Survey(folder.resolve().name, _time(results), results)
+
+
+def read_surveys(folders: Sequence[Path]) -> list[Survey]:
+    """The surveys of several runs, in the order of their dates; raises InputError where a folder is given twice."""
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError("a folder is given twice: give each survey once")
+    return sorted((read_survey(folder) for folder in folders), key=lambda survey: (survey.time, survey.name))
 
 
 def _time(results: Results) -> datetime:
