@@ -38,6 +38,8 @@ UNSEEN = -1.0
 # Of two rims the inner one ends the barrel (an elbow or a collar has further rims outside): what the outermost position
 # costs of an edge's strength, 0 to 1.
 OUTER_PENALTY = 0.3
+# Views that tell a rim without those that look into the end: a shadow beside it moves from one to the next.
+LEAST_OUTSIDE = 3
 # Scale [m] of the Cauchy distribution of the barrel's end about that of the cloud's surface, which may be torn.
 SURFACE_SIGMA = 0.01
 # The cloud's surface goes on over the end by half a stereo window [m], and into a bend of three radii as far as that
@@ -116,13 +118,25 @@ def rim_strength(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Strength (V * SECTORS, T), 0 to 1, of edges across the axis at `along` (T,) [m] beyond the end, and where seen.
 
-    An edge as strong as twice the median one has half.
+    An edge as strong as twice the median one has half. V: the views that the end is sought in (`_outside_views`).
     """
-    rows = cylinder_rows(others)
-    edges = np.concatenate([_slopes(barrel, along, view, rows) for view in views])
+    edges = np.concatenate(_outside_views(barrel, along, views, cylinder_rows(others)))
     seen = np.isfinite(edges)
     typical = float(np.median(np.abs(edges[seen]))) if seen.any() else 0.0
     return np.where(seen, np.abs(edges) / (np.abs(edges) + 2.0 * typical + 1e-9), 0.0), seen
+
+
+def _outside_views(barrel: Cylinder, along: FloatArray, views: Sequence[View], others: FloatArray) -> list[FloatArray]:
+    """The slopes (SECTORS, T) of the views that do not look into the end; of all where too few such show the barrel.
+
+    Who looks at the face of an end sees its rim twice: the near half, between barrel and face, which may be alike, and
+    the far half, before the background, up to a diameter farther along the barrel.
+    """
+    into = np.array([(view.centre - barrel.end) @ barrel.axis > 0.0 for view in views])
+    outside = [_slopes(barrel, along, views[index], others) for index in np.flatnonzero(~into)]
+    if sum(bool(np.isfinite(edges).any()) for edges in outside) >= LEAST_OUTSIDE:
+        return outside
+    return outside + [_slopes(barrel, along, views[index], others) for index in np.flatnonzero(into)]
 
 
 def _contrast(rim: FloatArray, best: int) -> float:
