@@ -48,6 +48,10 @@ class LimbEdges:
     sigma: FloatArray
     explained: FloatArray
 
+    def select(self, keep: NDArray[np.bool_]) -> LimbEdges:
+        """Those of the profiles that a mask (N,) names."""
+        return LimbEdges(self.offset[keep], self.sigma[keep], self.explained[keep])
+
     def displaced(self, by: FloatArray) -> LimbEdges:
         """The edges with all offsets of a profile moved by its value (N,) [px]."""
         return replace(self, offset=self.offset + by[:, None])

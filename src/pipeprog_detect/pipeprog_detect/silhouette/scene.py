@@ -191,8 +191,13 @@ def frame(cylinder: Cylinder, towards: FloatArray) -> FloatArray:
 
 
 def viewing_direction(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
-    """Mean unit vector (3,) from the cameras to the cylinder's middle."""
-    directions = cylinder.middle - ViewArrays.of(views).centres
+    """Mean unit vector (3,) to the cylinder's middle from the cameras that show it; from all where none does.
+
+    What is known worst is the distance from those that look at it: a step along another direction moves the images.
+    """
+    arrays = ViewArrays.of(views)
+    showing = arrays.showing(cylinder.middle[None])
+    directions = cylinder.middle - (arrays.centres[showing] if showing.any() else arrays.centres)
     return np.asarray((directions / np.linalg.norm(directions, axis=1)[:, None]).mean(axis=0), np.float64)
 
 

@@ -16,7 +16,7 @@ from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
-from pipeprog_detect.thin.depth_from_cloud import at_cloud_depth, covers, mean_centre
+from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.thin.pair_views import pair_views
 from pipeprog_detect.thin.parallel_axes import (
@@ -113,15 +113,19 @@ class _LineFitter:
     def along_known_pipes(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
         """The whole of a pipe of which the direction is known; None where its contour is not seen.
 
-        Views from one height leave its depth open: then it is sought from where the cloud has it, too, and the best
-        supported fit counts.
+        Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
+        away looks the same, from where the cloud has it, too, and the best supported fit counts.
         """
-        starts = [(proposal.cylinder, min(proposal.depth_sigma, LINE_DEPTH_SIGMA))]
-        if proposal.depth_sigma > DEPTH_SIGMA * proposal.cylinder.radius:
-            centre = mean_centre(proposal.cylinder, self.views)
-            at_depth = None if centre is None else at_cloud_depth(proposal.cylinder, self.points, centre, False)
-            starts += [] if at_depth is None else [(at_depth, DEPTH_SIGMA * at_depth.radius)]
-        fits = [self._parallel(*start, known) for start in starts]
+        start, depth_sigma = proposal.cylinder, proposal.depth_sigma
+        if depth_sigma <= DEPTH_SIGMA * start.radius:
+            return self._parallel(start, depth_sigma, known)
+        centre = mean_centre(start, self.views)
+        at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, False)
+        rough = [(start, min(depth_sigma, DEPTH_REACH))] + ([] if at_depth is None else [(at_depth, LINE_DEPTH_SIGMA)])
+        starts = [Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True) for each, sigma in rough]
+        located = [refine(each, self.views, known, self.radii) for each in starts]
+        again = [replace(fit.cylinder, radius=start.radius) for fit in located if fit is not None]
+        fits = [self._parallel(each, LINE_DEPTH_SIGMA, known) for each in again]
         return max((fit for fit in fits if fit is not None), key=lambda fit: fit.support, default=None)
 
     def _parallel(self, start: Cylinder, depth_sigma: float, known: Sequence[Cylinder]) -> ContourFit | None:

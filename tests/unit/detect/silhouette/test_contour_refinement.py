@@ -8,6 +8,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pipeprog_camera.camera import Camera
+from pipeprog_detect.silhouette.contour_adjustment import LEAST_IN_VIEW, adjusted
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, frame
 from pipeprog_detect.types import Cylinder, View
@@ -121,3 +123,18 @@ def test_no_radius_is_below_zero_where_edges_of_texture_pull_it(
                 assert (fit is not None) == (on_an_edge and views is pipe_views)
             if fit is not None:
                 assert fit.cylinder.radius > 0
+
+
+def test_a_glimpse_of_a_pipe_does_not_measure_it(pipe_views: list[View]) -> None:
+    """A view that shows 24 px of its length: fewer samples than tell its edges from those of texture."""
+    whole = pipe_views[0]
+    left, top = 200, 120
+    lens = whole.camera
+    camera = Camera(80, 24, lens.fx, lens.fy, lens.cx - left, lens.cy - top)
+    image = np.ascontiguousarray(whole.image[top : top + camera.height, left : left + camera.width])
+    glimpse = dataclasses.replace(whole, stamp=99, image=image, camera=camera)
+    scene = Scene.of(PIPE, [*pipe_views, glimpse], [])
+    assert 0 < (scene.samples().view == len(pipe_views)).sum() < LEAST_IN_VIEW
+    found = adjusted(scene, np.zeros((5, 5)), np.zeros(5))
+    assert found is not None
+    assert set(found.samples.view.tolist()) == set(range(len(pipe_views)))
