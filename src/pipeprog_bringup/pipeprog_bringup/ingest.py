@@ -11,19 +11,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_bringup.footage.camera_file import CameraFile, read_camera_file
+from pipeprog_bringup.footage.camera_file import read_camera_file
+from pipeprog_bringup.footage.guessed_camera import GUESS_SIGMA, guessed_camera
 from pipeprog_bringup.footage.polycam import Polycam
 from pipeprog_bringup.footage.record3d import Record3D
 from pipeprog_bringup.footage.shot import Excerpt, Footage, Shot
 from pipeprog_bringup.footage.stray_scanner import StrayScanner
 from pipeprog_bringup.footage.video import Video
 from pipeprog_bringup.recording import cdr
-from pipeprog_bringup.recording.bag import readout_key
+from pipeprog_bringup.recording.bag import focal_sigma_key, readout_key
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results.atomic_output import output_file
 from pipeprog_camera.errors import InputError
 
 FRAME_ID = "camera_optical_frame"
+GUESS_NOTE = (
+    f"{{}}: the focal length is what the file says, a guess to {GUESS_SIGMA:.0%}: the survey calibrates itself, for "
+    "which a board must be seen from several sides; a calibration is better (docs/calibration.md)"
+)
 IMAGE_TOPIC, INFO_TOPIC = "/camera/image/compressed", "/camera/camera_info"
 
 
@@ -57,10 +62,16 @@ def ingest(request: Request, report: Callable[[float, str], None]) -> Ingested:
     calibration = read_camera_file(request.camera) if request.camera else None
     if request.out.suffix != ".mcap":
         raise InputError(f"--out {request.out}: a recording is an .mcap file")
-    footage = _footage(request, calibration)
+    footage = _app(request.source)
+    is_guess = footage is None and calibration is None
+    if footage is None:
+        camera = calibration.camera if calibration else guessed_camera(request.source)
+        footage = Video(request.source, camera, request.camera or request.source)
     stamps: list[int] = []
     encoded = 0
     with output_file(request.out, request.force) as temporary, temporary.open("wb") as stream, BagWriter(stream) as bag:
+        if is_guess:
+            bag.describe({focal_sigma_key(IMAGE_TOPIC): repr(GUESS_SIGMA)})
         if calibration and calibration.readout is not None:
             bag.describe({readout_key(IMAGE_TOPIC): repr(calibration.readout)})
         for shot in footage.shots(request.excerpt):
@@ -71,30 +82,25 @@ def ingest(request: Request, report: Callable[[float, str], None]) -> Ingested:
         if not stamps:
             raise InputError(f"{request.source} has no frame between --start and --end: give times within it")
     kept = len(stamps) - encoded
-    notes = [f"{kept} frames were JPEG already and are kept as they were"] if kept else []
+    notes = [GUESS_NOTE.format(request.source)] if is_guess else []
+    notes += [f"{kept} frames were JPEG already and are kept as they were"] if kept else []
     return Ingested(len(stamps), 1e-9 * (stamps[-1] - stamps[0]), [*footage.notes, *notes])
 
 
-def _footage(request: Request, calibration: CameraFile | None) -> Footage:
-    """The source by its form; raises InputError where it is none, or a video without its calibration."""
-    source = request.source
-    app: Footage | None = None
+def _app(source: Path) -> Footage | None:
+    """What an app has recorded, by its form; None for a file that may be a video, InputError for any other folder."""
     if (source / "odometry.csv").is_file():
-        app = StrayScanner(source)
-    elif (source / "keyframes").is_dir():
-        app = Polycam(source)
-    elif source.suffix == ".r3d" and source.is_file():
-        app = Record3D(source)
-    if app:
-        return app
+        return StrayScanner(source)
+    if (source / "keyframes").is_dir():
+        return Polycam(source)
+    if source.suffix == ".r3d" and source.is_file():
+        return Record3D(source)
     if source.exists() and not source.is_file():
         raise InputError(
             f"{source} is a folder, a device or a pipe, and no scan of Stray Scanner or Polycam (raw data): "
             "give such a folder, or a video file"
         )
-    if request.camera is None or calibration is None:
-        raise InputError(f"{source}: a video needs the calibration of its camera: give --camera CAMERA.yaml")
-    return Video(source, calibration.camera, request.camera)
+    return None
 
 
 def _write(bag: BagWriter, shot: Shot, quality: int) -> None:

@@ -32,6 +32,9 @@ from pipeprog_detect.product.product import Product
 from pipeprog_node.messages import points_from_cloud
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
+FOCAL_SIGMA = "sfm.calibration.focal_sigma"
+GUESSED_DISTORTION = 0.1  # standard deviation of k1 where no distortion is known: lenses of phones have up to 0.2
+
 
 @dataclasses.dataclass(frozen=True)
 class Request:
@@ -127,10 +130,19 @@ def _read(request: Request) -> _Inputs:
         raise InputError(f"--rate {request.rate:g}: give a factor above zero, 1 for real time")
     if "frames.lockstep" in _names(request):
         raise InputError("--set frames.lockstep: a replay is always in lockstep, or it would lose frames")
-    known = [] if "sfm.readout" in _names(request) or bag.readout is None else [f"sfm.readout={bag.readout!r}"]
-    configs = effective([*known, *request.overrides])
+    configs = effective([*_told_by(bag, _names(request)), *request.overrides])
     configs["frames"] = dataclasses.replace(configs["frames"], lockstep=True)
     return _Inputs(bag, boq, board_file, configs)
+
+
+def _told_by(bag: Bag, given: set[str]) -> list[str]:
+    """Settings that a recording tells of its camera, those that the user has given left out."""
+    told: dict[str, float] = {}
+    if bag.readout is not None:
+        told["sfm.readout"] = bag.readout
+    if bag.focal_sigma is not None:
+        told |= {FOCAL_SIGMA: bag.focal_sigma, "sfm.calibration.distortion_sigma": GUESSED_DISTORTION}
+    return [f"{name}={value!r}" for name, value in told.items() if name not in given]
 
 
 def _names(request: Request) -> set[str]:

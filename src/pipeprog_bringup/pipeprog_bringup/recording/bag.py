@@ -143,6 +143,19 @@ class Bag:
         return readout
 
     @property
+    def focal_sigma(self) -> float | None:
+        """The relative standard deviation of a focal length that is a guess; None for a calibration."""
+        facts = [file.facts for file in self._files if isinstance(file, McapFile)]
+        told = [fact[key] for fact in facts if (key := focal_sigma_key(self.image_topic)) in fact]
+        try:
+            return float(told[0]) if told else None
+        except ValueError:
+            raise InputError(
+                f"{self.path}: {told[0][:40]!r} is no standard deviation of a focal length: ingest the video again, or "
+                "give --set sfm.calibration.focal_sigma=..."
+            ) from None
+
+    @property
     def losses(self) -> list[str]:
         """The parts of the recording that cannot be read, one sentence each; complete once it was read to its end."""
         damaged = [f"{count} messages on {topic} left out: damaged" for topic, count in self._left_out.items() if count]
@@ -163,6 +176,11 @@ class Bag:
 def readout_key(image_topic: str) -> str:
     """The key of a recording's metadata record `pipeprog` that has the read-out of a camera."""
     return f"readout_{image_topic}"
+
+
+def focal_sigma_key(image_topic: str) -> str:
+    """The key of the same record that has the relative standard deviation of a focal length that is a guess."""
+    return f"focal_sigma_{image_topic}"
 
 
 def _opened(path: Path) -> MessageFile:
