@@ -244,7 +244,7 @@ class Reconstruction:
     def _refine_camera(self, final: bool) -> bool:
         """Goes on with the camera that the map says, where the boards agree; whether it does."""
         poses = self._map.camera_from_model()
-        if not poses:
+        if not poses or self._config.readout > 0:  # these residuals are of images whose rows are exposed at once
             return False
         used = self._images[next(iter(poses))].camera
         found = self._mapper.self_calibration(self._camera.told(used), self._camera.config)
