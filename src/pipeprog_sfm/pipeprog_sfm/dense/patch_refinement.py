@@ -18,6 +18,7 @@ ROWS = np.repeat(np.arange(-RADIUS, RADIUS + 1, dtype=np.float32), 2 * RADIUS + 
 PLANE_RADIUS = 2  # grid pixels around one whose inverse depths give its slant
 SAME_SURFACE = 0.01  # relative difference of depth up to which neighbouring pixels lie on one surface
 CORRELATION_MIN = 0.3  # below, a view does not see the patch
+MATCHED = 0.9  # signal of nine times the noise's power (correlation = S / (S + N)): no other plane is tried then
 STEP_MAX = 0.004  # of the depth: linearisation of an image holds for about a pixel
 SAME_PLANE = 0.0007  # of the depth, a fifth of STEP_MAX: Gauss-Newton takes planes this near to the same depth
 GAIN_MIN, GAIN_MAX = 0.7, 1.4  # of one view's contrast over another's: exposure, viewing angle
@@ -112,7 +113,10 @@ def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride):  # type: ignore[no-untyped-def]
-    """Takes over the plane of a grid neighbour where it matches better, then one Gauss-Newton step of the depth."""
+    """Takes over the plane of a grid neighbour where it matches better, then one Gauss-Newton step of the depth.
+
+    A pixel whose own plane has MATCHED keeps it.
+    """
     height, width = inverse_depth.shape
     out = np.full((height, width), np.nan, np.float32)
     correlations = np.zeros((height, width), np.float32)
@@ -160,6 +164,8 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
                 )  # fmt: skip
                 if score > best:
                     best_depth, best, best_step, best_sigma = depth, score, step, sigma
+                if best > np.float32(MATCHED):
+                    break
             if best_sigma > 0.0:
                 limit = np.float32(STEP_MAX) * best_depth
                 out[row, column] = best_depth + min(max(best_step, -limit), limit)
