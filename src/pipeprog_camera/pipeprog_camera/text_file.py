@@ -18,6 +18,15 @@ _KINDS = {
     stat.S_IFSOCK: "a socket",
 }
 
+# First bytes of files that are given in place of texts.
+_BINARY = {
+    b"\xff\xd8\xff": "a JPEG image",
+    b"\x89PNG": "a PNG image",
+    b"%PDF": "a PDF document",
+    b"PK\x03\x04": "an archive or an office document",
+    b"\x89MCAP": "a recording (mcap)",
+}
+
 
 def read_text(path: str | Path, most: int) -> str:
     """The text of a regular file of at most `most` bytes, without its byte order mark.
@@ -25,6 +34,9 @@ def read_text(path: str | Path, most: int) -> str:
     Raises InputError, naming the file and the remedy, for what is no such file; a device or pipe is never opened.
     """
     data = read_bytes(path, most)
+    for magic, kind in _BINARY.items():
+        if data.startswith(magic):
+            raise InputError(f"{path} is {kind}, not a text file: give the file that the option asks for")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -76,7 +76,20 @@ def parse_yaml(text: str, source: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        raise InputError(f"{source}{line}: is no YAML ({problem}): mend that line, or write the file again") from None
+        raise InputError(f"{source}{line}: is no YAML ({problem}): {_remedy(text, mark)}") from None
+
+
+def _remedy(text: str, mark: Any) -> str:
+    """What to do about an error at a mark: of the usual mistakes, which one it is."""
+    lines = text.splitlines()
+    near = lines[max(0, mark.line - 1) : mark.line + 1] if mark else []
+    if any("\t" in line for line in near):
+        return "it has a tab: indent with spaces"
+    if any(line.count(a) != line.count(b) for line in near for a, b in (("{", "}"), ("[", "]"))):
+        return "a bracket is open: close each { with } and each [ with ]"
+    if any(re.match(r"\s*\w+:", line) for line in near):
+        return "each entry of a list begins with a dash, and its keys stand below each other: `- name: A`"
+    return "mend that line, or write the file again"
 
 
 def line_of(value: Any, key: Any = None) -> str:

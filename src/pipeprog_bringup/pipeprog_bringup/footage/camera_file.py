@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.file_kinds import kind_of
 from pipeprog_camera.outside_text import name_of, shown
 from pipeprog_camera.rolling_shutter import check_readout
 from pipeprog_camera.yaml_file import line_of, read_yaml
@@ -30,6 +31,8 @@ def read_camera_file(path: Path) -> CameraFile:
     try:
         if not isinstance(content, dict):
             raise InputError("it is no mapping")
+        if "camera_matrix" not in content and (kind := kind_of(content)):
+            raise InputError(kind)
         width, height = (int(_number(content, key, content.get(key))) for key in ("image_width", "image_height"))
         matrix, distortion = (_numbers(content, key) for key in ("camera_matrix", "distortion_coefficients"))
         if len(matrix) != 9:

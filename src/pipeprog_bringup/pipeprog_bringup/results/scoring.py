@@ -20,6 +20,7 @@ from pipeprog_bringup.results.pipes_file import number, rows_of, vector
 from pipeprog_bringup.results.result_files import read_frame_stamps, read_trajectory
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.file_kinds import kind_of
 from pipeprog_camera.json_file import read_json
 from pipeprog_camera.limits import MAX_CLASSES, MAX_COORDINATE, MAX_SCORED
 from pipeprog_camera.outside_text import name_of, shown
@@ -203,6 +204,8 @@ def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Alignme
 def read_result(path: Path) -> Result:
     """The pipes.json of a run; raises InputError where it is none."""
     content = read_json(path)
+    if isinstance(content, dict) and "classes" not in content and (kind := kind_of(content)):
+        raise InputError(f"{path} is no pipes.json of pipeprog: {kind}: give the results first, then the truth")
     try:
         pipes = tuple(_segment(pipe, str(pipe.get("id")), f"pipe {n}") for n, pipe in _numbered(content, "pipes"))
         rows = rows_of(content, "classes", MAX_CLASSES)
@@ -220,6 +223,8 @@ def read_result(path: Path) -> Result:
 def read_truth(path: Path) -> Truth:
     """A truth file; raises InputError where it is none."""
     content = read_json(path)
+    if isinstance(content, dict) and "scale" in content and (kind := kind_of(content)):
+        raise InputError(f"{path} is no truth file: {kind}: give the results first, then the truth")
     try:
         pipes = tuple(
             _segment(pipe, str(pipe.get("id", n - 1)), f"pipe {n}") for n, pipe in _numbered(content, "pipes")

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.file_kinds import kind_of
 from pipeprog_camera.outside_text import nearest, shown
 from pipeprog_camera.yaml_file import line_of, read_yaml
 from pipeprog_detect.plan.entry import Entry
@@ -16,6 +17,8 @@ def yaml_entries(path: Path) -> list[Entry]:
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no mapping: a bill of quantities begins with 'classes:'")
+    if "classes" not in content and (kind := kind_of(content)):
+        raise InputError(f"{path} is no bill of quantities: {kind}: are two files swapped?")
     for key in content:
         if key != "classes":
             raise InputError(

@@ -68,7 +68,11 @@ def find_size(text: str) -> Size | None:
 
 
 def nearest_name(text: str) -> str:
-    """The known size whose name is most like `text`."""
+    """The known size whose name is most like `text`; of one with an inch mark, among the sizes in inches."""
+    if re.search(r'["″]|\binch', text):
+        inches = re.sub(r'["″]|\binch(es)?\b', " ", text).replace(" ", "")
+        known = [name for name in SIZES if name.startswith("NPS ")]
+        return difflib.get_close_matches(f"NPS {inches} steel", known, n=1, cutoff=0.0)[0]
     by_plain = {_plain(name): name for name in SIZES}
     return by_plain[difflib.get_close_matches(_plain(text), by_plain, n=1, cutoff=0.0)[0]]
 

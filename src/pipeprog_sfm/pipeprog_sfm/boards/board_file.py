@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.file_kinds import kind_of
 from pipeprog_camera.limits import MAX_BOARD_CIRCLES, MAX_CIRCLES, MAX_KNOWN_DISTANCES, MAX_TARGET_LENGTH
 from pipeprog_camera.outside_text import name_of, nearest, shown
 from pipeprog_camera.yaml_file import line_of, read_yaml
@@ -92,6 +93,8 @@ def load_board_file(path: str | Path) -> BoardFile:
             that is not in the file, or the discs of a scale bar overlap.
     """
     content = read_yaml(path)
+    if isinstance(content, dict) and not {"boards", "marks"} & content.keys() and (kind := kind_of(content)):
+        raise InputError(f"{path} is no board file: {kind}: are two files swapped?")
     keys = () if isinstance(content, dict) and "marks" in content else ("boards",)
     content = _entry(content, keys, str(path), optional=("boards", "distances", "marks"))
     entries = {key: content.get(key, []) for key in ("boards", "distances", "marks")}
