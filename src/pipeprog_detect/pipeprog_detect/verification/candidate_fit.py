@@ -22,8 +22,9 @@ CONVINCING = 0.5
 SETTLED, MAX_ROUNDS = 0.1, 3
 # A planned radius within this share of one that is not planned is tried, and taken with this share of its support.
 NEAR_PLANNED, AS_GOOD = 0.15, 0.6
-# Planned radii are within reach of a candidate up to this many standard deviations.
-REACH = 3.0
+# Planned radii are within reach of a candidate up to this many standard deviations, and of a fit, which adds the
+# tolerance of manufacture (1 %, EN 10255).
+REACH, MANUFACTURE = 3.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -88,14 +89,22 @@ class CandidateFitter:
     ) -> ContourFit | None:
         """The best supported fit of a planned radius that the cloud of a blurred candidate allows; None without one.
 
-        Lines beside a thin pipe, such as its shadow's, are taken for its contour where its radius is left open.
+        Lines beside a thin pipe, such as its shadow's, are taken for its contour where its radius is left open. A fit
+        that they have led three standard deviations away from the planned radius is one of theirs.
         """
         if not candidate.blurred:
             return None
         noise, cylinder = candidate.evidence.noise, candidate.cylinder
         near = [planned for planned in self._radii() if abs(planned - cylinder.radius) < REACH * _sigma(candidate)]
-        fits = [_at_radius(cylinder, planned, noise, views, others) for planned in near]
-        good = [fit for fit in fits if fit is not None and fit.support > CONVINCING and self.is_planned(fit)]
+        fits = [(planned, _at_radius(cylinder, planned, noise, views, others)) for planned in near]
+        good = [
+            fit
+            for planned, fit in fits
+            if fit is not None
+            and fit.support > CONVINCING
+            and self.is_planned(fit)
+            and abs(fit.cylinder.radius - planned) < REACH * fit.radius_sigma + MANUFACTURE * planned
+        ]
         return max(good, key=lambda fit: fit.support, default=None)
 
     def _radii(self) -> list[float]:
