@@ -148,6 +148,39 @@ def test_a_run_with_pipes_json_alone(tmp_path: Path) -> None:
     assert "p01" in text
 
 
+def with_fields(folder: Path, **fields: float) -> Path:
+    """The survey, its one class with these fields in pipes.json."""
+    content = json.loads((folder / "pipes.json").read_text())
+    content["walls_m2"] = 40.0
+    content["classes"][0] |= fields
+    (folder / "pipes.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_what_was_not_seen_stands_below_the_answer(tmp_path: Path) -> None:
+    metres = {"missing_m": 0.5, "unclear_m": 0.0, "hidden_m": 0.4, "not_seen_m": 1.1}
+    folder = with_fields(survey(tmp_path / "a"), **metres, walls_seen_percent=61.0)
+    _, text = read(report([folder], tmp_path / "a.html", False, silent))
+    told = "1.50 m were not seen (0.40 m hidden, 1.10 m out of view); 0.50 m were looked for and are not there"
+    assert told in text
+    assert "Thin coverage" in text
+    assert "not seen [m]" in text
+
+
+def test_without_places_the_walls_are_told(tmp_path: Path) -> None:
+    folder = with_fields(survey(tmp_path / "a"), walls_seen_percent=88.0)
+    _, text = read(report([folder], tmp_path / "a.html", False, silent))
+    assert "88 % of the 40 m² of walls that were found was seen well enough" in text
+    assert "Thin coverage" not in text
+
+
+def test_a_survey_that_stopped_early_is_warned_of(tmp_path: Path) -> None:
+    folder = survey(tmp_path / "a")
+    (folder / "run.json").write_text(json.dumps({"frames_in_bag": 65, "frames_considered": 40}))
+    _, text = read(report([folder], tmp_path / "a.html", False, silent))
+    assert "The survey stopped early: 40 of 65 images were worked off" in text
+
+
 def test_a_run_without_pipes(tmp_path: Path) -> None:
     folder = survey(tmp_path / "run")
     result_files.write_pipes(folder / "pipes.json", Product([], [], []), result_files.Scale("cloud", 0.0))
