@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,9 @@ class Cloud:
 class View:
     """One keyframe: grey image (H, W) uint8 of the ideal pinhole camera (already undistorted), and its pose.
 
-    `nearest` (h, w) float32, where it is known: depth [m] of what the cloud shows in each of h x w equal cells.
+    Pixels are those of the stamp, at which a camera with a rolling shutter exposes its middle row: `rolled` tells where
+    the image shows them, None: there. `nearest` (h, w) float32, where it is known: depth [m] of what the cloud shows in
+    each of h x w equal cells.
     """
 
     stamp: int
@@ -33,12 +36,17 @@ class View:
     camera: Camera
     camera_from_map: FloatArray
     nearest: NDArray[np.float32] | None = None
+    rolled: RolledImage | None = None
 
     @cached_property
     def centre(self) -> FloatArray:
         """The projection centre (3,) in the map frame [m]."""
         rotation = self.camera_from_map[:3, :3]
         return -rotation.T @ self.camera_from_map[:3, 3]
+
+    def shown(self, pixels: FloatArray, depths: FloatArray) -> FloatArray:
+        """Where the image shows (N, 2) what lies at pixels (N, 2) at depths (N,) [m]."""
+        return pixels if self.rolled is None else self.rolled.shown(pixels, depths)
 
     @cached_property
     def geometry(self) -> FloatArray:

@@ -34,6 +34,7 @@ class ContourSamples:
         along: position (N,) on the axis from the cylinder's middle [m].
         gain: displacement (N,) of the line for one metre of the surface [px/m].
         half_width: apparent radius (N,) of the pipe [px].
+        depth: of the surface there (N,), along the optical axis [m].
         jacobian: (N, 5) outward displacement [px] for one metre of each component of a step: offsets along the basis
             of the axis' start (2) and end (2), and of the radius.
     """
@@ -45,6 +46,7 @@ class ContourSamples:
     along: FloatArray
     gain: FloatArray
     half_width: FloatArray
+    depth: FloatArray
     jacobian: FloatArray
 
     def __len__(self) -> int:
@@ -169,7 +171,22 @@ def contour_samples(
     jacobian[:, 2:4] = (gain * share)[:, None] * columns[:, 5:7]
     jacobian[:, 4] = gain
     along = (share - 0.5) * cylinder.length
-    return ContourSamples(view, side, columns[:, 0:2], columns[:, 2:4], along, gain, gain * cylinder.radius, jacobian)
+    pixel, normal, half_width, depth = columns[:, 0:2], columns[:, 2:4], gain * cylinder.radius, columns[:, 7]
+    samples = ContourSamples(view, side, pixel, normal, along, gain, half_width, depth, jacobian)
+    if all(each.rolled is None for each in views):
+        return samples
+    return samples.select(_within_images(samples, views, margin))
+
+
+def _within_images(samples: ContourSamples, views: Sequence[View], margin: float) -> NDArray[np.bool_]:
+    """Mask (N,) of the samples that rolling shutters show farther than `margin` [px] inside the images."""
+    result = np.ones(len(samples), bool)
+    for index, part in parts_by_view(samples, len(views)):
+        view = views[index]
+        shown = view.shown(samples.pixel[part], samples.depth[part])
+        size = np.array([view.camera.width, view.camera.height])
+        result[part] = ((shown > margin) & (shown < size - 1 - margin)).all(axis=1)
+    return result
 
 
 @njit(cache=True, nogil=True)
@@ -185,11 +202,12 @@ def _contour_lines(
     fractions: FloatArray,
     margin: float,
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """View, side and position (N,) of the samples that lie within an image, and their columns (N, 7).
+    """View, side and position (N,) of the samples that lie within an image, and their columns (N, 8).
 
-    These are: pixel (2), outward normal (2), gain, and the displacement of the surface along the outward normal by a
-    step along the basis (2). The gain is exact: displacing the surface by d along its outward normal at the contact
-    generator moves the line by d / (depth |l|) pixels, l being the image line of the tangent plane (envelope theorem).
+    These are: pixel (2), outward normal (2), gain, the displacement of the surface along the outward normal by a step
+    along the basis (2), and depth. The gain is exact: displacing the surface by d along its outward normal at the
+    contact generator moves the line by d / (depth |l|) pixels, l being the image line of the tangent plane (envelope
+    theorem).
 
     Args:
         line: start and unit direction (2, 3) of the axis.
@@ -205,7 +223,7 @@ def _contour_lines(
     """
     most = 2 * len(poses) * len(fractions)
     indices = np.empty((3, most), np.int64)
-    columns = np.empty((most, 7))
+    columns = np.empty((most, 8))
     count = 0
     start, axis = np.ascontiguousarray(line[0]), np.ascontiguousarray(line[1])
     for v in range(len(poses)):
@@ -242,5 +260,6 @@ def _contour_lines(
                 columns[count, 4] = 1.0 / (depth * slope)
                 for k in range(2):
                     columns[count, 5 + k] = -(basis[k] * normal).sum()
+                columns[count, 7] = depth
                 count += 1
     return indices[0, :count].copy(), indices[1, :count].copy(), indices[2, :count].copy(), columns[:count].copy()

@@ -37,13 +37,14 @@ _WEIGHTS = _cubic_weights()
 
 
 def light_across(
-    image: NDArray[np.uint8], pixel: FloatArray, normal: FloatArray, offsets: FloatArray, lines: int
+    image: NDArray[np.uint8], pixel: FloatArray, across: FloatArray, along: FloatArray, offsets: FloatArray, lines: int
 ) -> NDArray[np.float32]:
-    """Light (N, Q), 0 to 255, at `offsets` (Q,) [px] along unit normals (N, 2) through pixel (N, 2).
+    """Light (N, Q), 0 to 255, at `offsets` (Q,) times the steps `across` (N, 2) a line through pixel (N, 2).
 
-    It is the mean of `lines` parallels one pixel apart. Points outside the image repeat its border.
+    It is the mean of `lines` parallels, one step `along` (N, 2) the line apart; steps are about a pixel long. Points
+    outside the image repeat its border.
     """
-    return _across(image, pixel, normal, offsets, lines, LINEAR_LIGHT, _WEIGHTS)
+    return _across(image, pixel, across, along, offsets, lines, LINEAR_LIGHT, _WEIGHTS)
 
 
 def light_at(image: NDArray[np.uint8], pixel: FloatArray) -> NDArray[np.float32]:
@@ -83,7 +84,8 @@ def _cubic(
 def _across(
     image: NDArray[np.uint8],
     pixel: FloatArray,
-    normal: FloatArray,
+    across: FloatArray,
+    along: FloatArray,
     offsets: FloatArray,
     lines: int,
     light: NDArray[np.float32],
@@ -93,13 +95,13 @@ def _across(
     result = np.zeros((len(pixel), len(offsets)), np.float32)
     share = np.float32(1.0 / lines)
     for i in range(len(pixel)):
-        across, down = normal[i, 0], normal[i, 1]
+        right, down = across[i, 0], across[i, 1]
         for line in range(lines):
             shift = line - 0.5 * (lines - 1)
-            x, y = pixel[i, 0] - shift * down, pixel[i, 1] + shift * across
+            x, y = pixel[i, 0] + shift * along[i, 0], pixel[i, 1] + shift * along[i, 1]
             for q in range(len(offsets)):
                 at = offsets[q]
-                result[i, q] += share * _cubic(image, x + at * across, y + at * down, light, weights)
+                result[i, q] += share * _cubic(image, x + at * right, y + at * down, light, weights)
     return result
 
 

@@ -177,12 +177,12 @@ def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: FloatArray)
     radial = np.cos(angle)[:, None] * towards + np.sin(angle)[:, None] * np.cross(axis, towards)
     points = end + along[None, :, None] * axis + barrel.radius * radial[:, None]
     pixel, depth = project(view, points.reshape(-1, 3))
-    camera = view.camera
+    camera, shown = view.camera, view.shown(pixel, depth)
     sharp = (
         (depth > NEAR_PLANE)
-        & (pixel > 2).all(axis=1)
-        & (pixel[:, 0] < camera.width - 3)
-        & (pixel[:, 1] < camera.height - 3)
+        & (shown > 2).all(axis=1)
+        & (shown[:, 0] < camera.width - 3)
+        & (shown[:, 1] < camera.height - 3)
     )
     there, deep = pixel[sharp], depth[sharp]
     sharp[sharp] = ~(hidden_by_cylinders(view, there, deep, others) | hidden_by_cloud(view, there, deep))
@@ -191,7 +191,7 @@ def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: FloatArray)
     if not inside.any():
         return unseen
     light = np.zeros(len(pixel))
-    light[sharp] = light_at(view.image, pixel[sharp])
+    light[sharp] = light_at(view.image, shown[sharp])
     mean = light.reshape(SECTORS, RAYS_PER_SECTOR, -1).mean(axis=1)
     return np.where(inside, gaussian_filter1d(mean, SAMPLES_PER_PIXEL, axis=1, order=1), np.nan)
 

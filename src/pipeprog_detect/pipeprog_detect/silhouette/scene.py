@@ -129,8 +129,11 @@ class Scene:
         """
         result = np.empty((len(samples), len(offsets)), np.float32)
         for index, part in parts_by_view(samples, len(self.views)):
-            image = self.views[index].image
-            result[part] = light_across(image, samples.pixel[part], samples.normal[part], offsets, lines)
+            view, pixel, across = self.views[index], samples.pixel[part], samples.normal[part]
+            along = np.stack([-across[:, 1], across[:, 0]], axis=1)
+            if view.rolled is not None:
+                pixel, across, along = view.rolled.shown_beside(pixel, (across, along), samples.depth[part])
+            result[part] = light_across(view.image, pixel, across, along, offsets, lines)
         return result
 
     def wide_profiles(self, samples: ContourSamples, furthest: float) -> Profiles:

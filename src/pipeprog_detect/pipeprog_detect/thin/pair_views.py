@@ -91,20 +91,38 @@ def _pair_view(
     if scale < 1.0:
         width, height = (max(round(scale * side), 1) for side in (view.camera.width, view.camera.height))
         image = np.asarray(cv2.resize(view.image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        view = replace(view, image=image, camera=view.camera.scaled(scale))
+        rolled = None if view.rolled is None else view.rolled.scaled(scale)
+        view = replace(view, image=image, camera=view.camera.scaled(scale), rolled=rolled)
         pixel = (pixel + 0.5) * scale - 0.5
     focal = view.camera.fx
     narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
     key = (view.stamp, view.camera.width)
     if key not in lines:
         lines[key] = straight_edges(view.image)
-    found = segment_pairs(lines[key], max(narrowest, 2.0), widest)
+    found = segment_pairs(_at_the_stamp(lines[key], view, float(middle)), max(narrowest, 2.0), widest)
     within = np.zeros(len(found), bool)
     for cylinder in known:
         within |= _within_silhouette(found, cylinder, view)
     found = found.select(~within)
     before, flat = _cloud_depths(found, pixel, depth, min(radii))
     return PairView(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
+
+
+def _at_the_stamp(edges: FloatArray, view: View, middle: float) -> FloatArray:
+    """Where straight edges (N, 2, 2) [px] of the image lie at the stamp, by the cloud's depths at their ends.
+
+    Where the cloud shows nothing the depth is `middle` [m].
+    """
+    if view.rolled is None or not len(edges):
+        return edges
+    ends = edges.reshape(-1, 2)
+    depth = np.full(len(ends), middle)
+    if view.nearest is not None:
+        rows, columns = view.nearest.shape
+        cell = np.floor(ends * (columns / view.camera.width)).astype(np.int64)
+        depth = view.nearest[np.clip(cell[:, 1], 0, rows - 1), np.clip(cell[:, 0], 0, columns - 1)].astype(float)
+        depth = np.where(np.isfinite(depth), depth, middle)
+    return view.rolled.motion.unrolled_pixels(ends, depth, view.rolled.camera).reshape(-1, 2, 2)
 
 
 def _cloud_depths(

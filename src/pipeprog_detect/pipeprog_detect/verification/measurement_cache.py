@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_detect.cloud.collinear import near
 from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.silhouette.apparent_contour import in_image
@@ -39,20 +40,24 @@ class Question:
         follow: whether the ends were sought.
         others: cylinders near enough to hide it.
         poses: camera_from_map (4, 4) by stamp of the views that may see it.
+        rolled: how their rolling shutters show it, by stamp.
     """
 
     cylinder: Cylinder
     follow: bool
     others: list[Cylinder]
     poses: dict[int, FloatArray]
+    rolled: dict[int, RolledImage]
 
     @classmethod
     def of(cls, cylinder: Cylinder, follow: bool, others: Sequence[Cylinder], views: Sequence[View]) -> Question:
         """The question of a fit among all `others` and `views`."""
         beside = [other for other in others if near(other, cylinder, _BESIDE)]
         around = cylinder.at(_AROUND)
-        poses = {view.stamp: view.camera_from_map for view in views if in_image(view, around).any()}
-        return cls(cylinder, follow, beside, poses)
+        seeing = [view for view in views if in_image(view, around).any()]
+        poses = {view.stamp: view.camera_from_map for view in seeing}
+        rolled = {view.stamp: view.rolled for view in seeing if view.rolled is not None}
+        return cls(cylinder, follow, beside, poses, rolled)
 
     def is_answered_by(self, earlier: Question) -> bool:
         """Whether nothing that the fit depends on has changed since an earlier question, but for a few more views."""
@@ -62,6 +67,7 @@ class Question:
             and earlier.poses.keys() <= self.poses.keys()
             and len(self.poses) <= (1.0 + _MORE_VIEWS) * len(earlier.poses)
             and all(_same_pose(pose, self.poses[stamp]) for stamp, pose in earlier.poses.items())
+            and all(_same_rows(rolled, self.rolled.get(stamp)) for stamp, rolled in earlier.rolled.items())
             and len(earlier.others) == len(self.others)
             and all(any(_unchanged(one, other) for other in self.others) for one in earlier.others)
         )
@@ -101,6 +107,15 @@ def _same_pose(one: FloatArray, other: FloatArray) -> bool:
     turn = float(np.linalg.norm(one[:3, :3] - other[:3, :3]))  # sqrt(2) times the angle
     shift = float(np.linalg.norm(one[:3, :3].T @ one[:3, 3] - other[:3, :3].T @ other[:3, 3]))
     return turn < np.sqrt(2.0) * _TURNED and shift < _SHIFTED
+
+
+def _same_rows(one: RolledImage, other: RolledImage | None) -> bool:
+    """Whether the first and the last row, the farthest from the stamp, have the same poses."""
+    if other is None or one.motion.readout != other.motion.readout:
+        return False
+    farthest = 0.5 * one.motion.readout
+    turn = farthest * float(np.linalg.norm(one.motion.angular - other.motion.angular))
+    return turn < _TURNED and farthest * float(np.linalg.norm(one.motion.linear - other.motion.linear)) < _SHIFTED
 
 
 def _unchanged(one: Cylinder, other: Cylinder) -> bool:

@@ -57,7 +57,7 @@ def test_light_is_that_of_cubic_interpolation(inner: bool) -> None:
     mapped = at.reshape(360, -1, 2)
     expected = cv2.remap(light, mapped[..., 0], mapped[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     # OpenCV rounds positions to a 32nd of a pixel; the steepest edge rises by 80 levels over one.
-    found = light_across(shown, pixel, normal, offsets, 6)
+    found = light_across(shown, pixel, normal, np.stack([-normal[:, 1], normal[:, 0]], axis=1), offsets, 6)
     np.testing.assert_allclose(found, expected.reshape(60, 6, -1).mean(axis=1), atol=1.5)
     assert abs(float((found - expected.reshape(60, 6, -1).mean(axis=1)).mean())) < 0.02
     single = light_at(shown, at[:, 0, 0].astype(float))
@@ -162,7 +162,7 @@ def test_least_squares_with_offsets_of_views(unknowns: int) -> None:
     offset[RANDOM.random((count, 2)) < 0.1] = np.nan
     sigma = np.where(np.isfinite(offset), RANDOM.uniform(0.05, 0.8, offset.shape), np.inf)
     none = np.zeros(count)
-    samples = ContourSamples(number, side, np.zeros((count, 2)), np.zeros((count, 2)), none, none, none, jacobian)
+    samples = ContourSamples(number, side, np.zeros((count, 2)), np.zeros((count, 2)), none, none, none, none, jacobian)
     prior, so_far = np.eye(unknowns) * 1e3, RANDOM.normal(0.0, 1e-3, unknowns)
     found = contour_adjustment._solve(samples, LimbEdges(offset, sigma, np.ones_like(offset)), views, prior, so_far)
     step, by_view = _in_numpy(jacobian, sign, number, offset, sigma, views, prior, so_far)
