@@ -85,6 +85,7 @@ class FakeNode(Node):
         self.create_subscription(CameraInfo, "keyframes/camera_info", self._count_info, qos.reliable(50))
         self.create_subscription(PointCloud2, "map_points", self._on_map, qos.latched())
         self.create_subscription(PathMsg, "keyframe_poses", lambda _: None, qos.latched())
+        self.create_subscription(msg.KeyframeVelocities, "keyframe_velocities", lambda _: None, qos.latched())
         self.create_subscription(msg.SfmStatus, "sfm_status", lambda _: None, qos.latched())
 
     def _count_info(self, _: CameraInfo) -> None:

@@ -50,6 +50,10 @@ class Keyframes:
         """Whether `view` has the image at hand."""
         return stamp in self._images
 
+    def camera(self, stamp: int) -> Camera:
+        """The calibration of a keyframe."""
+        return self._encoded[stamp][1]
+
     def view(self, stamp: int, map_from_camera: FloatArray) -> View:
         """The keyframe at its pose (4, 4); raises InputError where it cannot be decoded."""
         encoded, camera = self._encoded[stamp]

@@ -28,7 +28,7 @@ from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
 from pipeprog_detect.product.pipe_runs import PipeRun
 from pipeprog_detect.product.product import Product
-from pipeprog_detect.types import Cylinder, Pipe
+from pipeprog_detect.types import Cylinder, Pipe, RowVelocities
 from pipeprog_detect.worker import (
     Decoding,
     Event,
@@ -48,13 +48,13 @@ from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import IMAGES, REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
-from pipeprog_node.received import ReceivedCamera, ReceivedCloud, ReceivedPoses, ReceivedStatus
+from pipeprog_node.received import ReceivedCamera, ReceivedCloud, ReceivedPoses, ReceivedStatus, ReceivedVelocities
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 
-POINTS, POSES = "map_points", "keyframe_poses"
+POINTS, POSES, VELOCITIES = "map_points", "keyframe_poses", "keyframe_velocities"
 MAP_PARTS = (ReceivedStatus, ReceivedPoses, ReceivedCloud)
-MAX_PENDING = 16  # stamps of which one message of three has arrived: poses come after each keyframe, maps rarely
+MAX_PENDING = 16  # stamps of which some messages have arrived: poses come after each keyframe, maps rarely
 TICK = 1.0  # s
 # Ticks without a keyframe that a map contains, until the map does without. Both come from this machine or its network
 # within a second; ticks are counted, not seconds, so that a node that stood still first hears what waits for it.
@@ -62,12 +62,16 @@ PATIENCE = 10
 
 
 class CompleteMap(NamedTuple):
-    """The parts of a map; `camera` where the survey has refined the calibration."""
+    """The parts of a map.
+
+    `camera` where the survey has refined the calibration, `velocities` where it was made with a rolling shutter.
+    """
 
     status: ReceivedStatus
     poses: ReceivedPoses
     cloud: ReceivedCloud
     camera: ReceivedCamera | None
+    velocities: ReceivedVelocities | None
 
 
 class MapInput:
@@ -85,16 +89,14 @@ class MapInput:
         intake.subscribe(PointCloud2, POINTS, received.map_points, self._keep, qos.latched())
         intake.subscribe(Path, POSES, received.keyframe_poses, self._keep, qos.latched())
         intake.subscribe(CameraInfo, REFINED_CALIBRATION, received.camera_info, self._keep, qos.latched())
+        intake.subscribe(msg.KeyframeVelocities, VELOCITIES, received.keyframe_velocities, self._keep, qos.latched())
         intake.subscribe(msg.SfmStatus, "sfm_status", received.sfm_status, self._on_status, qos.latched())
 
     @property
     def newest(self) -> CompleteMap | None:
         """The complete map whose first part came last."""
-        for parts in reversed(self._parts.values()):
-            if _is_complete(parts):
-                status, poses, cloud = (parts[kind] for kind in MAP_PARTS)
-                return CompleteMap(status, poses, cloud, parts[ReceivedCamera] if status.camera_refined else None)
-        return None
+        complete = (_complete(parts) for parts in reversed(self._parts.values()))
+        return next((parts for parts in complete if parts is not None), None)
 
     def discard(self, taken: CompleteMap) -> None:
         """Forgets a map and those before it."""
@@ -105,11 +107,14 @@ class MapInput:
         if status.revision:
             self._keep(status)
 
-    def _keep(self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus | ReceivedCamera) -> None:
+    def _keep(
+        self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus | ReceivedCamera | ReceivedVelocities
+    ) -> None:
         parts = self._parts.setdefault(part.stamp, {})
         parts[type(part)] = part
-        if _is_complete(parts):
-            self.revision = max(self.revision, parts[ReceivedStatus].revision)
+        complete = _complete(parts)
+        if complete is not None:
+            self.revision = max(self.revision, complete.status.revision)
         while len(self._parts) > MAX_PENDING or (len(self._parts) > 1 and self._points() > MAX_CLOUD_POINTS):
             self._parts.popitem(last=False)
         self._use()
@@ -119,10 +124,30 @@ class MapInput:
         return sum(len(cloud.points) for cloud in clouds)
 
 
-def _is_complete(parts: Mapping[type, Any]) -> bool:
-    """Whether all that belongs to a map has come."""
-    return all(kind in parts for kind in MAP_PARTS) and (
-        not parts[ReceivedStatus].camera_refined or ReceivedCamera in parts
+def _complete(parts: Mapping[type, Any]) -> CompleteMap | None:
+    """The map of these parts, None while some of what belongs to it are missing."""
+    if not all(kind in parts for kind in MAP_PARTS):
+        return None
+    status, poses, cloud = (parts[kind] for kind in MAP_PARTS)
+    camera = parts.get(ReceivedCamera) if status.camera_refined else None
+    velocities = parts.get(ReceivedVelocities) if status.readout > 0.0 else None
+    if (status.camera_refined and camera is None) or (status.readout > 0.0 and velocities is None):
+        return None
+    return CompleteMap(status, poses, cloud, camera, velocities)
+
+
+def _map_command(whole: CompleteMap, final: bool) -> Map:
+    """The command to detect in a map."""
+    status, poses, cloud, camera, velocities = whole
+    return Map(
+        status.revision,
+        cloud.points,
+        cloud.normals,
+        poses.stamps,
+        poses.map_from_camera,
+        final,
+        None if camera is None else camera.camera,
+        None if velocities is None else RowVelocities(velocities.readout, velocities.linear, velocities.angular),
     )
 
 
@@ -214,13 +239,16 @@ class DetectNode(Node):
         newest = self._maps.newest
         if newest is None or not self._supervision.takes_requests:
             return
-        status, poses, cloud, refined = newest
+        status, poses, velocities = newest.status, newest.poses, newest.velocities
         final = self._finish.expected is not None and status.revision >= self._finish.expected
         if not (self._intermediate or final) or self._missing(poses):
             return
         self._maps.discard(newest)
-        camera = refined.camera if refined else None
-        command = Map(status.revision, cloud.points, cloud.normals, poses.stamps, poses.map_from_camera, final, camera)
+        if velocities is not None and len(velocities.linear) != len(poses.stamps):
+            count = f"{len(velocities.linear)} velocities for {len(poses.stamps)} poses"
+            self._refuse(status.revision, f"{VELOCITIES} has {count} of one map: each keyframe has one", VELOCITIES)
+            return
+        command = _map_command(newest, final)
         if self._supervision.is_poison(command):
             self._refuse(status.revision, "detection processes died of this map before: it is not tried again")
             return
@@ -235,9 +263,9 @@ class DetectNode(Node):
         if self._finish.expected is not None and self._revision >= self._finish.expected:
             self._finish.answer(self._revision)
 
-    def _refuse(self, revision: int, problem: str) -> None:
-        """No pipes will come of a map."""
-        self._intake.reject(POINTS, InvalidMessageError("no detection", problem))
+    def _refuse(self, revision: int, problem: str, topic: str = POINTS) -> None:
+        """No pipes will come of a map, for what a topic brought."""
+        self._intake.reject(topic, InvalidMessageError("no detection", problem))
         if self._finish.expected is not None and revision >= self._finish.expected:
             self._finish.answer(self._revision, problem)
 

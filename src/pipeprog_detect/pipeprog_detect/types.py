@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
+from pipeprog_camera.rolling_shutter import RowMotion
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,26 @@ class View:
         camera = self.camera
         lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
         return np.concatenate([self.camera_from_map[:3].ravel(), lens, self.centre])
+
+
+@dataclass(frozen=True)
+class RowVelocities:
+    """How the map moves, seen from M keyframes, while their rows are read out.
+
+    Attributes:
+        readout: from the first row to the last [s].
+        linear: (M, 3) [m/s].
+        angular: (M, 3) [rad/s].
+    """
+
+    readout: float
+    linear: FloatArray
+    angular: FloatArray
+
+    def rolled(self, index: int, camera: Camera) -> RolledImage:
+        """Where the keyframe of that number, of that calibration, shows what its pose at the stamp would."""
+        motion = RowMotion(self.readout, camera.height, self.linear[index], self.angular[index])
+        return RolledImage(motion, camera)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -19,7 +19,7 @@ from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.pipe_tracker import PipeTracker
 from pipeprog_detect.product.product import Product, product_of
-from pipeprog_detect.types import Cloud, Cylinder, View
+from pipeprog_detect.types import Cloud, Cylinder, RowVelocities, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 
 
@@ -39,7 +39,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Map:
-    """Command: detect in this map; poses (M, 4, 4) map_from_camera belong to stamps (M,).
+    """Command: detect in this map; poses (M, 4, 4) map_from_camera and velocities belong to stamps (M,).
 
     What is found in a `final` map does not depend on the maps before it. A `camera` replaces that of all keyframes.
     """
@@ -51,11 +51,12 @@ class Map:
     map_from_camera: NDArray[np.float64]
     final: bool
     camera: Camera | None = None
+    velocities: RowVelocities | None = None
 
     @property
     def content(self) -> tuple[object, ...]:
         """What is recognised when it comes again, under another revision, too."""
-        return self.points, self.normals, self.stamps, self.map_from_camera, self.camera
+        return self.points, self.normals, self.stamps, self.map_from_camera, self.camera, self.velocities
 
 
 @dataclass(frozen=True)
@@ -131,13 +132,16 @@ def serve(
 
 def _views(connection: Connection, command: Map, keyframes: Keyframes) -> Iterator[View]:
     """The keyframes of a map that can be decoded; says which one is, so that it is known if this process dies of it."""
-    for stamp, pose in zip(command.stamps.tolist(), command.map_from_camera, strict=True):
+    for number, (stamp, pose) in enumerate(zip(command.stamps.tolist(), command.map_from_camera, strict=True)):
         if stamp not in keyframes:
             continue
         if not keyframes.is_decoded(stamp):
             connection.send(Decoding(stamp))
         try:
-            yield keyframes.view(stamp, pose)
+            view = keyframes.view(stamp, pose)
+            if command.velocities is not None:
+                view = replace(view, rolled=command.velocities.rolled(number, keyframes.camera(stamp)))
+            yield view
         except InputError as error:
             keyframes.remove(stamp)
             connection.send(KeyframeUnusable(stamp, str(error)))

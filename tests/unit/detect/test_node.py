@@ -90,11 +90,12 @@ class Stage:
         self._infos = publish(CameraInfo, "keyframes/camera_info", qos.reliable(50))
         self._points = publish(PointCloud2, "map_points", qos.latched())
         self._poses = publish(Poses, "keyframe_poses", qos.latched())
+        self._velocities = publish(msg.KeyframeVelocities, "keyframe_velocities", qos.latched())
         self._status = publish(msg.SfmStatus, "sfm_status", qos.latched())
         self._executor = SingleThreadedExecutor()
         for node in (self.node, self.others):
             self._executor.add_node(node)
-        topics = (self._images, self._infos, self._points, self._poses, self._status)
+        topics = (self._images, self._infos, self._points, self._poses, self._velocities, self._status)
         self.spin_until(
             lambda: (
                 all(topic.get_subscription_count() for topic in topics)
@@ -123,13 +124,20 @@ class Stage:
         info.k[0] = focal_length
         self._infos.publish(info)
 
-    def send_map(self, stamp: int, revision: int, keyframes: list[int], points: FloatArray) -> None:
+    def send_map(
+        self, stamp: int, revision: int, keyframes: list[int], points: FloatArray, readout: float = 0.0
+    ) -> None:
         header = messages.header(stamp, "map")
         self._points.publish(messages.point_cloud(header, points, np.zeros((len(points), 3), np.uint8)))
         self._poses.publish(messages.path(header, np.array(keyframes), np.tile(np.eye(4), (len(keyframes), 1, 1))))
         status = msg.SfmStatus(map_revision=revision, scale_source="board", scale_sigma=0.0004)
         status.map_stamp = messages.time_msg(stamp)
+        status.readout = readout
         self._status.publish(status)
+
+    def send_velocities(self, stamp: int, readout: float, linear: FloatArray) -> None:
+        header = messages.header(stamp, "map")
+        self._velocities.publish(messages.keyframe_velocities(header, readout, linear, np.zeros_like(linear)))
 
     def values(self) -> dict[str, str]:
         """What the next diagnostics say, by key; the message under an empty one."""
@@ -201,6 +209,31 @@ def test_a_map_waits_for_its_keyframes(stage: Callable[..., Stage]) -> None:
     scene.spin_until(lambda: scene.pipes)
     assert scene.values()["keyframes"] == "2"
     assert scene.values()["pipes"] == "3"
+
+
+def test_a_map_of_a_rolling_shutter_waits_for_its_velocities(stage: Callable[..., Stage]) -> None:
+    """What no camera does is refused, and the map goes on waiting; as many velocities as poses make it whole."""
+    scene, stamps = stage(), [START, START + STEP]
+    for stamp in stamps:
+        scene.send_image(stamp)
+        scene.send_calibration(stamp)
+    scene.send_map(START, 1, stamps, corner(), readout=0.015)
+    scene.send_velocities(START, 1.0, np.zeros((2, 3)))
+    scene.spin_until(lambda: scene.values().get("dropped on keyframe_velocities: read-out") == "1")
+    scene.send_velocities(START, 0.015, np.full((2, 3), np.nan))
+    scene.spin_until(lambda: scene.values().get("dropped on keyframe_velocities: velocities") == "1")
+    assert scene.values()["map revision"] == "0"
+    scene.send_velocities(START, 0.015, np.array([[0.75, 0.0, 0.0], [0.7, 0.0, 0.1]]))
+    scene.spin_until(lambda: scene.pipes)
+    assert len(scene.pipes[0].pipes) == 3
+
+
+def test_velocities_of_other_keyframes_are_refused(stage: Callable[..., Stage]) -> None:
+    scene = stage()
+    scene.send_velocities(START, 0.015, np.zeros((3, 3)))
+    scene.send_map(START, 1, [], corner(), readout=0.015)
+    scene.spin_until(lambda: scene.values().get("dropped on keyframe_velocities: no detection") == "1")
+    assert not scene.pipes
 
 
 def test_a_wrong_calibration_ends_no_node_and_stops_no_map(stage: Callable[..., Stage]) -> None:

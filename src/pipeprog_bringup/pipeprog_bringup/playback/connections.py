@@ -17,6 +17,7 @@ SUBSCRIBERS = {
     "image_overlap": {"frames", "replay"},
     "map_points": {"detect"},
     "keyframe_poses": {"detect"},
+    "keyframe_velocities": {"detect"},
     "sfm_status": {"detect", "replay"},
     "frame_decisions": {"replay"},
 }

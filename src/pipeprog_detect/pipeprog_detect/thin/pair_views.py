@@ -116,12 +116,12 @@ def _at_the_stamp(edges: FloatArray, view: View, middle: float) -> FloatArray:
     if view.rolled is None or not len(edges):
         return edges
     ends = edges.reshape(-1, 2)
-    depth = np.full(len(ends), middle)
+    depth: FloatArray = np.full(len(ends), middle)
     if view.nearest is not None:
         rows, columns = view.nearest.shape
         cell = np.floor(ends * (columns / view.camera.width)).astype(np.int64)
-        depth = view.nearest[np.clip(cell[:, 1], 0, rows - 1), np.clip(cell[:, 0], 0, columns - 1)].astype(float)
-        depth = np.where(np.isfinite(depth), depth, middle)
+        there = view.nearest[np.clip(cell[:, 1], 0, rows - 1), np.clip(cell[:, 0], 0, columns - 1)]
+        depth = np.where(np.isfinite(there), there, middle).astype(float)
     return view.rolled.motion.unrolled_pixels(ends, depth, view.rolled.camera).reshape(-1, 2, 2)
 
 
