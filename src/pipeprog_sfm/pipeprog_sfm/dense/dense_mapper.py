@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage
+from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
 from pipeprog_sfm.dense.stereo import (
@@ -36,7 +38,26 @@ NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector w
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
 SAMPLE = 200  # points of a keyframe from which its overlap with others is estimated, to 0.04
 SAME_SIDE = np.radians(8.0)  # between rays to a point; beyond (baseline 0.14 of the depth) a view adds information
+NO_MOTIONS: Mapping[int, RowMotion] = {}  # of a global shutter
+STILL = RowMotion(0.0, 1, np.zeros(3), np.zeros(3))  # all rows at the stamp, however many there are
 SAME_SCALE = 1.5  # ratio of depths; a view that is nearer by more shows more detail
+
+
+@dataclass(frozen=True)
+class _Source:
+    """A keyframe of which, or with which, a depth map is made."""
+
+    stamp: int
+    image: EncodedImage
+    pose: FloatArray
+    motion: RowMotion | None
+
+    def rolled(self, width: int) -> RolledImage | None:
+        """Its rolling shutter at the working resolution."""
+        if self.motion is None:
+            return None
+        whole = RolledImage(self.motion, self.image.camera)
+        return whole.scaled(width / whole.camera.width) if width < whole.camera.width else whole
 
 
 @dataclass(frozen=True)
@@ -77,6 +98,7 @@ class DenseMapper:
         images: Mapping[int, EncodedImage],
         points: Callable[[int], FloatArray],
         complete: bool,
+        motions: Mapping[int, RowMotion] = NO_MOTIONS,
     ) -> None:
         """Starts depth maps of the keyframes that have come, unless others show the same.
 
@@ -85,12 +107,13 @@ class DenseMapper:
             images: the keyframes by stamp.
             points: the (K, 3) points in the model that a keyframe sees.
             complete: no keyframe comes any more, so that the last ones need not wait for their neighbours.
+            motions: how a rolling shutter shows the keyframes, by stamp, in the model's unit; empty without one.
         """
         stamps = sorted(poses)
         for stamp in stamps if complete else stamps[:-LOOKAHEAD]:
             grown = len(poses) > 1.1 * self._refused.get(stamp, 0) + 2
             if stamp not in self._depths and stamp not in self._covered and (grown or complete):
-                self._consider(stamp, poses, images, points(stamp))
+                self._consider(stamp, poses, images, points(stamp), motions)
         self._submit(all_of_them=complete)
 
     def retire(self, stamps: Collection[int]) -> None:
@@ -130,7 +153,12 @@ class DenseMapper:
         return self._thread.submit(self._fuse, maps, dict(camera_from_model), scale, anew)
 
     def _consider(
-        self, stamp: int, poses: Mapping[int, FloatArray], images: Mapping[int, EncodedImage], points: FloatArray
+        self,
+        stamp: int,
+        poses: Mapping[int, FloatArray],
+        images: Mapping[int, EncodedImage],
+        points: FloatArray,
+        motions: Mapping[int, RowMotion],
     ) -> None:
         pose = poses[stamp]
         depth = points @ pose[2, :3] + pose[2, 3]
@@ -155,7 +183,7 @@ class DenseMapper:
             return
         # Surfaces without features lie beyond the sparse points' range as often as not.
         depth_range = (0.7 * float(near), 1.5 * float(far))
-        views = [(other, images[other], poses[other]) for other in [stamp, *pairs]]
+        views = [_Source(other, images[other], poses[other], _motion(motions, other)) for other in [stamp, *pairs]]
         future: Future[_Depth] = Future()
         self._depths[stamp] = future
 
@@ -173,9 +201,11 @@ class DenseMapper:
         while self._waiting and (all_of_them or len(self._submitted) < SUBMITTED):
             self._submitted.append(self._thread.submit(self._waiting.popleft()))
 
-    def _depth(self, views: list[tuple[int, EncodedImage, FloatArray]], depth_range: tuple[float, float]) -> _Depth:
+    def _depth(self, views: list[_Source], depth_range: tuple[float, float]) -> _Depth:
         width = self._stereo_config.width
-        images = [StereoImage(stamp, *self._image(image, width), pose) for stamp, image, pose in views]
+        images = [
+            StereoImage(view.stamp, *self._image(view.image, width), view.pose, view.rolled(width)) for view in views
+        ]
         reference, neighbours = images[0], images[1:]
         result = depth_map(reference, neighbours, depth_range, self._stereo_config)
         pose = reference.camera_from_world
@@ -250,6 +280,11 @@ def _decode(image: EncodedImage, width: int) -> tuple[NDArray[np.uint8], Camera]
     assert pixels is not None  # the mapper has read it
     undistorted = image.camera.undistort_image(pixels.astype(np.uint8, copy=False))
     return working_image(undistorted, image.camera.pinhole(), width)
+
+
+def _motion(motions: Mapping[int, RowMotion], stamp: int) -> RowMotion | None:
+    """That of a keyframe, still where it is unknown; None without a rolling shutter."""
+    return motions.get(stamp, STILL) if motions else None
 
 
 def _be_nice() -> None:

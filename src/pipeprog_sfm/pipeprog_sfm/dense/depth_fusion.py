@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.config import FusionConfig
+from pipeprog_sfm.dense.depth_sampling import depth_at
 from pipeprog_sfm.dense.stereo import DepthMap
 
 AGREEMENT = 0.01  # relative difference of depth up to which two views have seen the same surface
@@ -271,7 +272,7 @@ def _confirm(depth, others, matrix, other_matrices, others_from_view, agreement,
                     continue
                 qx = (T[0, 0] * x + T[0, 1] * y + T[0, 2]) * z + T[0, 3]
                 qy = (T[1, 0] * x + T[1, 1] * y + T[1, 2]) * z + T[1, 3]
-                seen = _sample(others[n], K[0, 0] * qx / qz + K[0, 2], K[1, 1] * qy / qz + K[1, 2], agreement)
+                seen = depth_at(others[n], K[0, 0] * qx / qz + K[0, 2], K[1, 1] * qy / qz + K[1, 2], agreement)
                 if not seen > 0.0:
                     continue
                 difference = (seen - qz) / qz
@@ -295,21 +296,6 @@ def _confirm(depth, others, matrix, other_matrices, others_from_view, agreement,
             normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = nx, ny, nz
             agreeing[v, u] = min(count, 254)
     return fused, normals, agreeing
-
-
-@njit(cache=True, nogil=True)
-def _sample(depth, u, v, agreement):  # type: ignore[no-untyped-def]
-    """Bilinear where the four pixels lie on one surface, else the nearest one; NaN outside."""
-    height, width = depth.shape
-    if not (0.0 <= u < width - 1 and 0.0 <= v < height - 1):
-        return np.nan
-    i, j = int(v), int(u)
-    du, dv = u - j, v - i
-    a, b, c, d = depth[i, j], depth[i, j + 1], depth[i + 1, j], depth[i + 1, j + 1]
-    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
-    if a + b + c + d > 0.0 and high - low < agreement * low:  # false for NaN
-        return (a * (1 - du) + b * du) * (1 - dv) + (c * (1 - du) + d * du) * dv
-    return depth[int(v + 0.5), int(u + 0.5)]
 
 
 @njit(cache=True, nogil=True)

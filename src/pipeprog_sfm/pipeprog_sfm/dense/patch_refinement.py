@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from pipeprog_sfm.dense.row_mapping import RowMapping, at_other_row, at_row, time_at
+
 RADIUS = 2  # of a patch [px]: 5 x 5, smaller than the thinnest pipe at working distance
 SIZE = (2 * RADIUS + 1) ** 2
 COLUMNS = np.tile(np.arange(-RADIUS, RADIUS + 1, dtype=np.float32), 2 * RADIUS + 1)  # of a patch's pixels
@@ -25,6 +27,7 @@ GAIN_MIN, GAIN_MAX = 0.7, 1.4  # of one view's contrast over another's: exposure
 NOISE = 0.7  # [grey levels] of two 8-bit images' difference at best
 FLATNESS = 2e-4  # of the depth: how far a pipe of 50 mm bulges over the plane's 9 px at 2 m, 0.4 mm
 OVERLAP = (2 * RADIUS + 1) ** 2 / 4.0  # patches that share a pixel on a grid of stride 2: their errors go together
+ROW_STEPS = 1  # after the first, from the row at the stamp to the one that shows a patch: 0.01 px are left
 ROUNDS = (1, 2, 0)  # distance in grid pixels at which each round takes over planes; 0: none
 
 
@@ -35,10 +38,12 @@ def refine(
     homographies: NDArray[np.float64],
     epipoles: NDArray[np.float64],
     stride: int,
+    rows: RowMapping | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Inverse depth on a grid of every `stride`-th pixel of `image`, improved; its correlation; its relative sigma.
 
-    A pixel (u, v) of inverse depth i lies at homographies[n] @ (u, v, 1) + i * epipoles[n] of neighbour n (N, h, w).
+    A pixel (u, v) of inverse depth i lies at homographies[n] @ (u, v, 1) + i * epipoles[n] of neighbour n (N, h, w);
+    with rolling `rows` that is so at the stamps, and inverse depth is on the optical axis of each row's own pose.
     The correlation is the mean of the better half of the views, so that an occluded side does no harm; sigma follows
     from the patches' gradients and residuals. All outputs have the grid's shape; inverse depth NaN where unknown.
     """
@@ -50,7 +55,7 @@ def refine(
     for distance in ROUNDS:
         inverse_depth, slant = _smooth(inverse_depth, sigma, stride)
         inverse_depth, correlation, sigma = _round(
-            inverse_depth, slant, image, fours, homographies, epipoles, better_half, distance, stride
+            inverse_depth, slant, image, fours, homographies, epipoles, better_half, distance, stride, rows
         )
     return _smooth(inverse_depth, sigma, stride)[0], correlation, sigma
 
@@ -112,7 +117,7 @@ def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
-def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride):  # type: ignore[no-untyped-def]
+def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride, rows):  # type: ignore[no-untyped-def]
     """Takes over the plane of a grid neighbour where it matches better, then one Gauss-Newton step of the depth.
 
     A pixel whose own plane has MATCHED keeps it.
@@ -128,6 +133,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
             continue
         patch = np.empty(SIZE, np.float32)
         scores = np.empty(len(neighbours), np.float32)
+        row_h, row_e = np.empty((3, 3), np.float32), np.empty(3, np.float32)
         for column in range(width):
             u = column * stride
             if u < RADIUS or u >= image.shape[1] - RADIUS or not inverse_depth[row, column] > 0.0:
@@ -161,6 +167,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
                     continue
                 score, step, sigma = _match(
                     patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores,
+                    rows, row_h, row_e,
                 )  # fmt: skip
                 if score > best:
                     best_depth, best, best_step, best_sigma = depth, score, step, sigma
@@ -175,7 +182,9 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
-def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores):  # type: ignore[no-untyped-def]
+def _match(  # type: ignore[no-untyped-def]
+    patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores, rows, row_h, row_e,
+):  # fmt: skip
     """Mean correlation over the better half of the views, Gauss-Newton step of the inverse depth, sigma (0: unseen).
 
     `patch` (SIZE,) is the reference's patch less its mean, `energy` the sum of its squares; `neighbours` (N, h, w)
@@ -188,6 +197,9 @@ def _match(patch, energy, neighbours, homographies, epipoles, u, v, depth, su, s
     for n in range(len(neighbours)):
         scores[n] = -1.0
         h, e = homographies[n], epipoles[n]
+        if rows is not None:
+            _at_rows(h, e, rows, n, u, v, depth, row_h, row_e)
+            h, e = row_h, row_e
         z = one / (h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * depth)
         x = (h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * depth) * z
         y = (h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * depth) * z
@@ -258,6 +270,26 @@ def _moments(patch, pixels, width, across, down):  # type: ignore[no-untyped-def
         cp += c * p
         cw += c * w
     return sw, sc, ww, wp, cc, cp, cw
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+def _at_rows(homography, epipole, rows, n, u, v, depth, h, e):  # type: ignore[no-untyped-def]
+    """Writes to h (3, 3) and e (3,) the mapping at the times of the rows that show the patch.
+
+    Within the patch both images move on alike: one time is that of all its rows.
+    """
+    at_row(homography, epipole, rows, n, rows.times[v, u], h, e)
+    a, shift = rows.other_turned[n, 0], rows.other_moved[n]
+    px = h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * depth
+    py = h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * depth
+    pz = h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * depth
+    time = time_at(rows.other_times[n], px / pz, py / pz)
+    for _ in range(ROW_STEPS):
+        x = px + time * (a[0, 0] * px + a[0, 1] * py + a[0, 2] * pz + depth * shift[0])
+        y = py + time * (a[1, 0] * px + a[1, 1] * py + a[1, 2] * pz + depth * shift[1])
+        z = pz + time * (a[2, 0] * px + a[2, 1] * py + a[2, 2] * pz + depth * shift[2])
+        time = time_at(rows.other_times[n], x / z, y / z)
+    at_other_row(rows, n, time, h, e)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")

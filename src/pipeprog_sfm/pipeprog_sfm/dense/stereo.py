@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_sfm.config import StereoConfig
 from pipeprog_sfm.dense.patch_refinement import refine
 from pipeprog_sfm.dense.plane_sweep import OVERSAMPLING, sweep
+from pipeprog_sfm.dense.row_mapping import RowMapping, depth_at_the_stamp, row_mapping
 
 FloatImage = NDArray[np.float32]
 ByteImage = NDArray[np.uint8]
@@ -33,17 +35,24 @@ SIGMA_MAX = 0.005  # of the depth, half of AGREEMENT in fusion: two maps then ag
 
 @dataclass(frozen=True)
 class StereoImage:
-    """An undistorted keyframe: (H, W, 3) uint8 BGR of a pinhole camera, and its pose in any unit of length."""
+    """An undistorted keyframe: (H, W, 3) uint8 BGR of a pinhole camera, and its pose in any unit of length.
+
+    `rolled`: how its rolling shutter shows the scene, in the same unit, at the image's size.
+    """
 
     stamp: int
     image: ByteImage
     camera: Camera
     camera_from_world: FloatArray
+    rolled: RolledImage | None = None
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth along the optical axis, (h, w) float32 in the unit of the poses, NaN where unknown; (h, w, 3) uint8 BGR."""
+    """Depth along the optical axis, (h, w) float32 in the unit of the poses, NaN where unknown; (h, w, 3) uint8 BGR.
+
+    Both are seen from the pose of the stamp, with a rolling shutter, too.
+    """
 
     stamp: int
     depth: FloatImage
@@ -120,17 +129,38 @@ def depth_map(
         homographies.append(other_camera.matrix @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
         epipoles.append(other_camera.matrix @ other_from_reference[:3, 3])
     homography, epipole = np.stack(homographies), np.stack(epipoles)
+    rolled = _at_width(reference.rolled, camera.width)
+    rows = None if rolled is None else _rows(rolled, reference, neighbours)
     inverse = sweep(
         cv2.pyrDown(_without_shading(gray)),
         np.stack([_low_pass(_without_shading(other.astype(np.float32))) for other in others]),
         homography @ np.diag([STRIDE, STRIDE, 1.0]),
         epipole,
         (1.0 / far, 1.0 / near),
+        None if rows is None else rows.thinned(STRIDE),
     )
-    inverse, correlation, sigma = refine(inverse, gray, np.stack(others), homography, epipole, STRIDE)
+    inverse, correlation, sigma = refine(inverse, gray, np.stack(others), homography, epipole, STRIDE, rows)
     known = (correlation >= CORRELATION_MIN) & (sigma <= SIGMA_MAX)
     depth = np.where(known, 1.0 / np.where(known, inverse, 1.0), np.nan).astype(np.float32)
+    if rolled is not None:
+        depth, places = depth_at_the_stamp(depth, rolled, STRIDE)
+        color = np.asarray(cv2.remap(color, places, None, cv2.INTER_LINEAR), np.uint8)
     return DepthMap(reference.stamp, depth, grid, color)
+
+
+def _rows(rolled: RolledImage, reference: StereoImage, neighbours: Sequence[StereoImage]) -> RowMapping:
+    """The mapping of rolling rows at the width of the reference's `rolled`; all neighbours have rolling shutters."""
+    pairs = [(_at_width(other.rolled, rolled.camera.width), other.camera_from_world) for other in neighbours]
+    world_from_reference = np.linalg.inv(reference.camera_from_world)
+    others = [(other, pose @ world_from_reference) for other, pose in pairs if other is not None]
+    return row_mapping(rolled, [other for other, _ in others], [pose for _, pose in others])
+
+
+def _at_width(rolled: RolledImage | None, width: int) -> RolledImage | None:
+    """The rolling shutter of an image reduced to `width`."""
+    if rolled is None or rolled.camera.width == width:
+        return rolled
+    return rolled.scaled(width / rolled.camera.width)
 
 
 def _without_shading(gray: FloatImage) -> FloatImage:

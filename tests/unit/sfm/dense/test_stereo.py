@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth maps against a ray-cast wall with a pipe in front of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,6 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage
+from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import StereoConfig
 from pipeprog_sfm.dense.stereo import StereoImage, choose_pairs, depth_map
 
@@ -15,6 +19,8 @@ CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 WALL, AXIS, RADIUS = 2.0, 1.75, 0.15  # metres in front of the middle of the row; the pipe stands upright
 RANGE = (1.2, 3.0)
 CONFIG = StereoConfig()
+# Seen from the camera, 60 ms from the first row to the last: 6 px sideways at the wall, and a turn of 4 px.
+MOTION = RowMotion(0.06, CAMERA.height, np.array([-0.75, 0.1, 0.1]), np.array([0.1, 0.25, 0.1]))
 
 
 def texture(points):
@@ -33,24 +39,35 @@ def pose(centre, rotation=(0.0, 0.0, 0.0)):
     return matrix
 
 
-def cast(camera_from_world, camera=CAMERA):
+def row_poses(camera_from_world, motion):
+    """Rotations (h, 3, 3) and shifts (h, 3) from the world to the camera when it exposes its rows."""
+    times = motion.row_times(np.arange(motion.height))[:, None]
+    turn = Rotation.from_rotvec(motion.angular * times)
+    shift = turn.apply(camera_from_world[:3, 3]) + motion.linear * times
+    return turn.as_matrix() @ camera_from_world[:3, :3], shift
+
+
+def cast(camera_from_world, camera=CAMERA, motion=None):
     """Depth along the optical axis and surface points (h, w, 3) of the wall and the pipe."""
+    still = RowMotion(0.0, camera.height, np.zeros(3), np.zeros(3))
+    rotations, shifts = row_poses(camera_from_world, motion or still)
     rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
     rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], -1)
-    rays = rays @ camera_from_world[:3, :3]
-    centre = -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-    depth = (WALL - centre[2]) / rays[..., 2]
+    rays = np.einsum("vij,vui->vuj", rotations, rays)
+    centre = -np.einsum("vij,vi->vj", rotations, shifts)[:, None]
+    depth = (WALL - centre[..., 2]) / rays[..., 2]
     a = rays[..., 0] ** 2 + rays[..., 2] ** 2
-    b = rays[..., 0] * centre[0] + rays[..., 2] * (centre[2] - AXIS)
-    c = centre[0] ** 2 + (centre[2] - AXIS) ** 2 - RADIUS**2
+    b = rays[..., 0] * centre[..., 0] + rays[..., 2] * (centre[..., 2] - AXIS)
+    c = centre[..., 0] ** 2 + (centre[..., 2] - AXIS) ** 2 - RADIUS**2
     hit = b * b - a * c > 0
     depth[hit] = ((-b - np.sqrt(np.where(hit, b * b - a * c, 0.0))) / a)[hit]
     return depth, centre + depth[..., None] * rays, hit
 
 
-def view(stamp, camera_from_world):
-    gray = np.clip(texture(cast(camera_from_world)[1]), 0, 255).astype(np.uint8)
-    return StereoImage(stamp, np.repeat(gray[..., None], 3, axis=2), CAMERA, camera_from_world)
+def view(stamp, camera_from_world, motion=None):
+    gray = np.clip(texture(cast(camera_from_world, motion=motion)[1]), 0, 255).astype(np.uint8)
+    rolled = None if motion is None else RolledImage(motion, CAMERA)
+    return StereoImage(stamp, np.repeat(gray[..., None], 3, axis=2), CAMERA, camera_from_world, rolled)
 
 
 LAYOUTS = {
@@ -81,6 +98,29 @@ def test_depth_lies_on_the_true_surfaces(scene):
     assert np.isfinite(error[pipe]).mean() > 0.85
     assert np.nanmedian(np.abs(error[pipe])) < 0.006
     assert (np.abs(error[interior & np.isfinite(error)]) > 0.05).mean() < 0.05  # outliers, fattened edges
+
+
+@pytest.mark.parametrize("layout", ["along the row", "up and down"])
+def test_a_rolling_shutter_costs_no_depth(layout):
+    """The depth map is seen from the pose of the stamp; taken for those of a still camera the images tell less."""
+    centre, others, _ = LAYOUTS[layout]
+    reference = view(0, pose(centre), MOTION)
+    swaying = [replace(MOTION, angular=sign * MOTION.angular) for sign in (-1.0, 1.0, -1.0, 1.0)]
+    neighbours = [
+        view(i + 1, pose(c, [0.02 * i, -0.1 * c[0], 0.0]), motion)
+        for i, (c, motion) in enumerate(zip(others, swaying, strict=True))
+    ]
+    found = depth_map(reference, neighbours, RANGE, CONFIG)
+    depth, _, on_pipe = cast(reference.camera_from_world, found.camera)
+    error = (found.depth - depth)[6:-6, 6:-6]
+    wall, pipe = ~on_pipe[6:-6, 6:-6], on_pipe[6:-6, 6:-6]
+    assert np.isfinite(error[wall]).mean() > 0.85
+    assert np.nanmedian(np.abs(error[wall])) < 0.004
+    assert np.isfinite(error[pipe]).mean() > 0.85
+    assert np.nanmedian(np.abs(error[pipe])) < 0.006
+    assert (np.abs(error[np.isfinite(error)]) > 0.05).mean() < 0.05
+    still = depth_map(replace(reference, rolled=None), neighbours, RANGE, CONFIG)
+    assert np.nanmedian(np.abs(still.depth - depth)[6:-6, 6:-6][wall]) > 0.006
 
 
 def test_same_input_gives_the_same_bytes(scene):

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stereo between images of a rolling shutter: each pixel of the reference is seen from the pose of its row's moment.
+
+Without a rolling shutter a pixel x of inverse depth i lies at H x + i e of a neighbour. Here H and e are those of the
+pose at the time t of the pixel's row, and the neighbour has turned and moved on until its own row's time s:
+
+    (I + s A + s^2 B) (H(t) x + i e(t)) + i s a,    H(t) = H + t H1 + t^2 H2,    e(t) = e + t e1 + t^2 e2.
+
+The series of the rotation ends at the square: the cube is below 0.001 px at 1 rad/s and a read-out of 30 ms.
+The neighbour's time follows from where the point is seen, which follows from the time: one fixed-point step from the
+row at the stamp leaves the square of the pixels that the image moves while one row is read, 0.1 px at worst.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage, row_of, shown_at
+from pipeprog_sfm.dense.depth_sampling import depth_at
+
+# Steps from a pixel at the stamp to where the image shows it: the depth is looked up anew in each.
+_STEPS = 3
+# The last step moves a pixel by less than this [px], or the pixel is hidden at the stamp: a contour lies between.
+_SETTLED = 0.5
+# Relative difference of depth up to which neighbouring pixels lie on one surface.
+_SAME_SURFACE = 0.01
+
+
+class RowMapping(NamedTuple):
+    """From pixels of a reference to N neighbours, both with rolling shutters; float32, see the module.
+
+    Attributes:
+        times: (h, w) of the reference's pixels [s].
+        turned: H1 and H2 (N, 2, 3, 3).
+        moved: e1 and e2 (N, 2, 3).
+        other_times: (N, h2, w2) of the neighbours' pixels [s].
+        other_clocks: (N, 2) time of their first row, and from one row to the next [s], without the lens's distortion.
+        other_turned: A and B (N, 2, 3, 3).
+        other_moved: a (N, 3).
+    """
+
+    times: NDArray[np.float32]
+    turned: NDArray[np.float32]
+    moved: NDArray[np.float32]
+    other_times: NDArray[np.float32]
+    other_clocks: NDArray[np.float32]
+    other_turned: NDArray[np.float32]
+    other_moved: NDArray[np.float32]
+
+    def thinned(self, stride: int) -> RowMapping:
+        """The mapping from every `stride`-th pixel of the reference, counted anew."""
+        wider = np.diag([stride, stride, 1]).astype(np.float32)
+        return self._replace(times=np.ascontiguousarray(self.times[::stride, ::stride]), turned=self.turned @ wider)
+
+
+def row_mapping(
+    reference: RolledImage, neighbours: Sequence[RolledImage], others_from_reference: Sequence[FloatArray]
+) -> RowMapping:
+    """The mapping; (4, 4) poses of the stamps, in the unit of the motions."""
+    spin = _cross(reference.motion.angular)
+    inverse = np.linalg.inv(reference.camera.matrix)
+    turned, moved, other_turned, other_moved = [], [], [], []
+    for neighbour, pose in zip(neighbours, others_from_reference, strict=True):
+        matrix = neighbour.camera.matrix
+        rotated = matrix @ pose[:3, :3]
+        turned.append([-rotated @ spin @ inverse, 0.5 * rotated @ spin @ spin @ inverse])
+        moved.append([-rotated @ reference.motion.linear, rotated @ spin @ reference.motion.linear])
+        other_spin, other_inverse = _cross(neighbour.motion.angular), np.linalg.inv(matrix)
+        other_turned.append(
+            [matrix @ other_spin @ other_inverse, 0.5 * matrix @ other_spin @ other_spin @ other_inverse]
+        )
+        other_moved.append(matrix @ neighbour.motion.linear)
+    times = np.stack([pixel_times(neighbour) for neighbour in neighbours])
+    clocks = [neighbour.numbers[[5, 4]] for neighbour in neighbours]
+    first, second, *others = (
+        np.array(values, np.float32) for values in (turned, moved, clocks, other_turned, other_moved)
+    )
+    return RowMapping(pixel_times(reference), first, second, times, *others)
+
+
+def pixel_times(image: RolledImage) -> NDArray[np.float32]:
+    """(h, w) float32: when the pixels of an undistorted image are exposed, s after the stamp."""
+    return _pixel_times(image.camera, image.motion.readout)
+
+
+@lru_cache(maxsize=4)
+def _pixel_times(camera: Camera, readout: float) -> NDArray[np.float32]:
+    u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    rows = camera.distort_points(np.stack([u.ravel(), v.ravel()], axis=1))[:, 1].reshape(u.shape)
+    return (((rows + 0.5) / camera.height - 0.5) * readout).astype(np.float32)
+
+
+def _cross(vector: FloatArray) -> FloatArray:
+    """(3, 3) matrix of the cross product with a vector (3,)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def at_row(homography, epipole, rows, n, time, h, e):  # type: ignore[no-untyped-def]
+    """Writes H(t) and e(t) of neighbour n to h (3, 3) and e (3,)."""
+    square = time * time
+    for i in range(3):
+        for j in range(3):
+            h[i, j] = homography[i, j] + time * rows.turned[n, 0, i, j] + square * rows.turned[n, 1, i, j]
+        e[i] = epipole[i] + time * rows.moved[n, 0, i] + square * rows.moved[n, 1, i]
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def at_other_row(rows, n, time, h, e):  # type: ignore[no-untyped-def]
+    """Turns and moves H(t) (3, 3) and e(t) (3,) on until the time s of a row of neighbour n, in place."""
+    a, b = rows.other_turned[n, 0], rows.other_turned[n, 1]
+    square = time * time
+    for j in range(3):
+        x, y, z = h[0, j], h[1, j], h[2, j]
+        for i in range(3):
+            turn = a[i, 0] * x + a[i, 1] * y + a[i, 2] * z
+            h[i, j] += time * turn + square * (b[i, 0] * x + b[i, 1] * y + b[i, 2] * z)
+    x, y, z = e[0], e[1], e[2]
+    for i in range(3):
+        turn = a[i, 0] * x + a[i, 1] * y + a[i, 2] * z + rows.other_moved[n, i]
+        e[i] += time * turn + square * (b[i, 0] * x + b[i, 1] * y + b[i, 2] * z)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def time_at(times, x, y):  # type: ignore[no-untyped-def]
+    """When the pixel nearest to (x, y) is exposed; beyond the image that at its border [s]."""
+    height, width = times.shape
+    return times[np.int64(min(max(y, 0.0), height - 1.0) + 0.5), np.int64(min(max(x, 0.0), width - 1.0) + 0.5)]
+
+
+def depth_at_the_stamp(
+    depth: NDArray[np.float32], image: RolledImage, stride: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A depth map of rolling rows, seen from the pose of the stamp, and where its pixels come from.
+
+    Args:
+        depth: (h, w) on the optical axis of each row's own pose, NaN where unknown.
+        image: the rolling shutter, in the unit of depth.
+        stride: each pixel (u, v) of the depth map is pixel (stride * u, stride * v) of the image.
+
+    Returns:
+        (h, w) depth on the optical axis at the stamp, and (h, w, 2) float32 pixels (u, v) of the given one.
+    """
+    known = depth[np.isfinite(depth)]
+    typical = float(np.median(known)) if len(known) else 1.0
+    coarser = np.array([1.0 / stride] * 4 + [stride] + [1.0] * 7)  # of focal lengths and centre, of s per row
+    return _at_the_stamp(depth, typical, image.numbers * coarser, image.rows / stride)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _at_the_stamp(depth, typical, numbers, rows):  # type: ignore[no-untyped-def]
+    """See `depth_at_the_stamp`; `typical`: depth where the search starts if nothing is known."""
+    height, width = depth.shape
+    result = np.full((height, width), np.nan, np.float32)
+    places = np.zeros((height, width, 2), np.float32)
+    for v in prange(height):
+        last = typical
+        for u in range(width):
+            there = float(depth[v, u])
+            if not there > 0.0:
+                there = last
+            x, y = shown_at(float(u), float(v), there, numbers, rows)
+            for _ in range(_STEPS):
+                z = np.float64(depth_at(depth, x, y, _SAME_SURFACE))
+                if not z > 0.0:
+                    there = np.nan
+                    break
+                there = _depth_at_stamp(x, y, z, numbers, rows)
+                before_x, before_y = x, y
+                x, y = shown_at(float(u), float(v), there, numbers, rows)
+            if there > 0.0 and max(abs(x - before_x), abs(y - before_y)) < _SETTLED:
+                result[v, u] = there
+                places[v, u] = x, y
+                last = there
+    return result, places
+
+
+@njit(cache=True, nogil=True)
+def _depth_at_stamp(u, v, z, numbers, rows):  # type: ignore[no-untyped-def]
+    """Depth at the stamp of what lies at depth z on the axis of its row's pose, at pixel (u, v) there."""
+    time = numbers[5] + numbers[4] * row_of(u, v, numbers, rows)
+    x = (u - numbers[2]) / numbers[0] * z - time * numbers[6]
+    y = (v - numbers[3]) / numbers[1] * z - time * numbers[7]
+    far = z - time * numbers[8]
+    a, b, c = -time * numbers[9], -time * numbers[10], -time * numbers[11]
+    # The third row of Rodrigues' formula up to the square of the angle.
+    return far + a * y - b * x + 0.5 * (a * (c * x - a * far) - b * (b * far - c * y))
