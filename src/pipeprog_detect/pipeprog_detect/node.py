@@ -107,9 +107,7 @@ class MapInput:
         if status.revision:
             self._keep(status)
 
-    def _keep(
-        self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus | ReceivedCamera | ReceivedVelocities
-    ) -> None:
+    def _keep(self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus | ReceivedCamera | ReceivedVelocities) -> None:
         parts = self._parts.setdefault(part.stamp, {})
         parts[type(part)] = part
         complete = _complete(parts)
