@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
@@ -154,12 +155,15 @@ class MapOutput:
         self.revision = 0
         self.frame = ""
         self.correction = 0.0
+        self._node = node
         self._logger = node.get_logger()
         self._map_stamp = self._pose_stamp = 0
         self._map_trajectory: Trajectory | None = None
         self._overlap = node.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.kept(50))
         self._points = node.create_publisher(PointCloud2, "map_points", qos.latched())
         self._poses = node.create_publisher(Path, "keyframe_poses", qos.latched())
+        # With a rolling shutter only.
+        self._velocities: Publisher[msg.KeyframeVelocities] | None = None
         self._statuses = node.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
         self._cameras = node.create_publisher(CameraInfo, REFINED_CALIBRATION, qos.latched())
         self._camera_refined = False
@@ -190,6 +194,13 @@ class MapOutput:
         # Stamps of two publications differ by a nanosecond at least, so that cloud and poses of a map can be paired.
         self._pose_stamp = max(int(trajectory.stamps[-1]), self._pose_stamp + 1)
         header = messages.header(self._pose_stamp, "map")
+        if trajectory.velocities is not None:
+            if self._velocities is None:
+                self._velocities = self._node.create_publisher(
+                    msg.KeyframeVelocities, "keyframe_velocities", qos.latched()
+                )
+            each = trajectory.velocities
+            self._velocities.publish(messages.keyframe_velocities(header, each.readout, each.linear, each.angular))
         self._poses.publish(messages.path(header, trajectory.stamps, trajectory.map_from_camera))
         return header
 
@@ -230,6 +241,8 @@ class MapOutput:
                 motion_considered=motion_considered,
                 camera_refined=self._camera_refined,
                 calibration=status.calibration,
+                readout=status.readout,
+                readout_sigma=status.readout_sigma,
                 message=status.message,
             )
         )

@@ -17,6 +17,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.camera_in_use import CameraInUse, board_agrees, radial_warning
 from pipeprog_sfm.config import SfmConfig
@@ -27,9 +28,11 @@ from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import NoScaleError, ScaleEstimate
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import RobotMotion
+from pipeprog_sfm.metric.unrolled_ellipses import RollingViews
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.sparse.overlap import OverlapReport
+from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.types import EncodedImage
 
 
@@ -49,14 +52,35 @@ class Status:
     scale: ScaleEstimate | None = None
     message: str = ""
     calibration: str = ""
+    readout: float = 0.0
+    readout_sigma: float = 0.0
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """How the map moves as seen from each camera while its rows are read out: see `RowMotion`.
+
+    Attributes:
+        readout: s.
+        linear: (M, 3) m/s.
+        angular: (M, 3) rad/s.
+    """
+
+    readout: float
+    linear: FloatArray
+    angular: FloatArray
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses in metres, z up: stamps (M,) int64 and map_from_camera (M, 4, 4) float64, in order of time."""
+    """Poses in metres, z up: stamps (M,) int64 and map_from_camera (M, 4, 4) float64, in order of time.
+
+    Velocities are given with a rolling shutter only.
+    """
 
     stamps: NDArray[np.int64]
     map_from_camera: FloatArray
+    velocities: Velocities | None = None
 
     def correction(self, earlier: Trajectory | None) -> float:
         """How far the keyframe is moved that has moved farthest since an earlier trajectory, m."""
@@ -87,7 +111,7 @@ class Reconstruction:
     """
 
     def __init__(self, config: SfmConfig, board_file: BoardFile, sources: Sequence[ScaleSource] = SOURCES) -> None:
-        self._mapper = Mapper(config.mapper, config.seed)
+        self._mapper = Mapper(config.mapper, config.seed, readout=max(config.readout, 0.0))
         self._map = self._mapper.map
         self._config = config
         self._deblurrer = Deblurrer(config)
@@ -121,7 +145,7 @@ class Reconstruction:
         self._images[stamp] = EncodedImage(encoded, camera)
         # Features and boards are measured in the image as it is: their points are undistorted, not resampled.
         self._sightings += bool(self._metric_tracker.add(stamp, gray, camera, frame))
-        report = self._mapper.add(stamp, gray, camera)
+        report = self._mapper.add(stamp, gray, camera, frame)
         poses = self._map.camera_from_model()
         for other, features in self._deblurrer.deblurred(stamp, self._images[stamp], poses, self._map.points_seen):
             self._mapper.replace_features(other, features)
@@ -198,6 +222,7 @@ class Reconstruction:
             self._scale,
             message,
             self._camera.description(),
+            self._map.readout,
         )
 
     def trajectory(self) -> Trajectory:
@@ -256,7 +281,9 @@ class Reconstruction:
         measured = self._metric_tracker.remeasured(
             ((stamp, image.gray()) for stamp, image in images.items()), found.camera
         )
-        if not board_agrees(self._metric_tracker.board_misfit(poses), measured.board_misfit(found.poses)):
+        rolling = _rolling(self._map.published, self._map.motions(self._map.published))
+        before = self._metric_tracker.board_misfit(poses, rolling)
+        if not board_agrees(before, measured.board_misfit(found.poses, rolling)):
             return False
         self._camera.accept(found)
         self._metric_tracker = measured
@@ -281,8 +308,20 @@ class Reconstruction:
             for stamp, pose in self._map.camera_from_model().items()
         }
         map_from_camera = np.stack([np.linalg.inv(pose) for pose in poses.values()])
-        trajectory = Trajectory(np.array(list(poses), np.int64), map_from_camera)
-        return self._scale, trajectory
+        stamps = np.array(list(poses), np.int64)
+        return self._scale, Trajectory(stamps, map_from_camera, self._velocities(stamps, self._scale.scale))
+
+    def _velocities(self, stamps: NDArray[np.int64], scale: float) -> Velocities | None:
+        """Of the published model's keyframes, zero where unknown; None without a rolling shutter."""
+        if not self._map.readout:
+            return None
+        motions = self._map.motions(self._map.published)
+        known = np.array([stamp in motions for stamp in stamps.tolist()])
+        velocities = np.zeros((2, len(stamps), 3))
+        for row in np.flatnonzero(known):
+            motion = motions[int(stamps[row])]
+            velocities[:, row] = scale * motion.linear, motion.angular
+        return Velocities(self._map.readout, *velocities)
 
     def _estimate_scale(self) -> None:
         """Publishes the largest model that has a scale; the reason is that of the largest one."""
@@ -298,7 +337,10 @@ class Reconstruction:
             first = next(iter(poses))
             try:
                 self._scale = self._metric_tracker.estimate(
-                    poses, partial(self._map.covariance, first), partial(self._map.points, first)
+                    poses,
+                    partial(self._map.covariance, first),
+                    partial(self._map.points, first),
+                    _rolling(model, self._map.motions(model)),
                 )
             except NoScaleError as error:
                 if number == 0:
@@ -306,6 +348,15 @@ class Reconstruction:
                 continue
             self._map.publish(first)
             return
+
+
+def _rolling(model: SparseModel, motions: dict[int, RowMotion]) -> RollingViews | None:
+    """What unrolls the pixels of a model's views; None with a global shutter."""
+
+    def points_seen(stamp: int) -> FloatArray:
+        return np.asarray(model.points[model.seen(model.stamps.index(stamp))])
+
+    return RollingViews(motions, points_seen) if motions else None
 
 
 def _metric_pose(camera_from_model: FloatArray, map_from_model: FloatArray) -> FloatArray:

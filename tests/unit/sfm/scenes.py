@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import match
 from pipeprog_sfm.features.sift import Features, root_sift
@@ -91,7 +92,10 @@ def pose(x: float, yaw: float = 0.0) -> NDArray[np.float64]:
     return matrix
 
 
-def view(camera_from_world: NDArray[np.float64], seed: int, period: float | None = None) -> Features:
+def view(
+    camera_from_world: NDArray[np.float64], seed: int, period: float | None = None, motion: RowMotion | None = None
+) -> Features:
+    """What a camera sees of the corner; with a motion, through a rolling shutter."""
     rng = np.random.default_rng(seed)
     points, looks = world(period)
     inside = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
@@ -99,6 +103,8 @@ def view(camera_from_world: NDArray[np.float64], seed: int, period: float | None
     seen = (inside[:, 2] > 0.2) & (pixels > 0).all(axis=1) & (pixels < [1280, 720]).all(axis=1)
     seen &= rng.random(len(points)) < 0.7
     index = rng.permutation(np.flatnonzero(seen))
+    if motion is not None:
+        pixels[index] = motion.rolled_pixels(pixels[index], inside[index], CAMERA)
     clutter = 100
     keypoints = pixels[index] + rng.normal(0, NOISE, (len(index), 2))
     keypoints = np.concatenate([keypoints, rng.uniform([0, 0], [1280, 720], (clutter, 2))])

@@ -90,7 +90,7 @@ def detect_ellipses(gray: NDArray[np.uint8], camera: Camera, config: BoardConfig
         undistorted = lens.undistort_points(points.reshape(-1, 2)).reshape(points.shape)
         # Far outside of a lens's image circle its distortion has no inverse.
         known = np.isfinite(undistorted[..., 0]) & np.isfinite(undistorted[..., 1])
-        centres, shapes, rms, good = _fit(np.where(known[..., None], undistorted, 0.0), weights * known)
+        centres, shapes, rms, good = fit_ellipses(np.where(known[..., None], undistorted, 0.0), weights * known)
         centres, shapes, rms = centres[good], shapes[good], rms[good]
         good = _plausible(shapes, config)
         centres, shapes, rms = centres[good], shapes[good], rms[good]
@@ -149,17 +149,10 @@ def _shapes(candidates: FloatArray) -> FloatArray:
 
 def _edge_points(gray: NDArray[np.uint8], centres: FloatArray, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Edge points (E, PROFILES, 2) on normals of ellipses, px of the image, and their 0/1 weights (E, PROFILES)."""
-    angles = np.arange(PROFILES) * (2 * np.pi / PROFILES)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    values, vectors = np.linalg.eigh(shapes)
-    axes = np.sqrt(np.maximum(values, 1e-6))
-    rim = np.einsum("eij,ej,pj->epi", vectors, axes, circle)
-    normals = np.einsum("eij,ej,pj->epi", vectors, 1.0 / axes, circle)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    reach = np.clip(REACH * axes[:, 0], MIN_REACH, MAX_REACH)
+    starts, normals, shorter = rim_points(centres, shapes)
+    reach = np.clip(REACH * shorter, MIN_REACH, MAX_REACH)
     count = int(2 * MAX_REACH / STEP) + 1
     offsets = np.linspace(-1.0, 1.0, count)[None, :] * reach[:, None]
-    starts = centres[:, None] + rim
     samples = (starts[:, :, None] + normals[:, :, None] * offsets[:, None, :, None]).astype(np.float32)
     grey = cv2.remap(
         gray, samples.reshape(len(centres), -1, 2), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -177,7 +170,21 @@ def _edge_points(gray: NDArray[np.uint8], centres: FloatArray, shapes: FloatArra
     return starts + normals * shift[..., None], weights.astype(float)
 
 
-def _fit(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+def rim_points(centres: FloatArray, shapes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(E, PROFILES, 2) points of ellipses, px, their unit normals, and the (E,) semi-minor axes."""
+    angles = np.arange(PROFILES) * (2 * np.pi / PROFILES)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    values, vectors = np.linalg.eigh(shapes)
+    axes = np.sqrt(np.maximum(values, 1e-6))
+    rim = np.einsum("eij,ej,pj->epi", vectors, axes, circle)
+    normals = np.einsum("eij,ej,pj->epi", vectors, 1.0 / axes, circle)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return centres[:, None] + rim, normals, axes[:, 0]
+
+
+def fit_ellipses(
+    points: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Ellipses through (E, P, 2) points with 0/1 weights (E, P): centres, shapes, rms and which of them are good.
 
     Points are scaled to a unit circle first, where the algebraic distance is twice the geometric one, which frees the

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +15,15 @@ from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile
-from pipeprog_sfm.boards.board_triangulation import place_boards
 from pipeprog_sfm.boards.ellipses import ImageEllipses, detect_ellipses
+from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.config import BoardConfig, OdometryConfig
 from pipeprog_sfm.metric.metric_frame import estimate_scale
 from pipeprog_sfm.metric.scale import NoScaleError, PoseCovariance, ScaleEstimate
 from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
-from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
+from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource, scale_bar_discs
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, TransformTree
+from pipeprog_sfm.metric.unrolled_ellipses import RollingViews, unrolled_ellipses
 
 
 class MetricTracker:
@@ -92,6 +94,7 @@ class MetricTracker:
         poses: Mapping[int, FloatArray],
         covariance: PoseCovariance | None = None,
         points: Callable[[], FloatArray] | None = None,
+        rolling: RollingViews | None = None,
     ) -> ScaleEstimate:
         """Scale and map frame at given poses.
 
@@ -99,18 +102,18 @@ class MetricTracker:
             poses: (4, 4) camera_from_model by stamp [ns], in order of time.
             covariance: of functions of the poses; None takes these for exact.
             points: gives (N, 3) points of the model, should nothing else tell the vertical.
+            rolling: motions of the views while their rows were read out; None: all rows at once.
 
         Raises:
             NoScaleError: as `estimate_scale`.
         """
         if not any(stamp in self._cameras for stamp in poses):
             raise NoScaleError("no_board", "no keyframe has been seen yet")
-        return estimate_scale(self._posed(poses, points), covariance, self._sources)
+        return estimate_scale(self._posed(poses, points, rolling), covariance, self._sources)
 
-    def board_misfit(self, poses: Mapping[int, FloatArray]) -> float | None:
+    def board_misfit(self, poses: Mapping[int, FloatArray], rolling: RollingViews | None = None) -> float | None:
         """By how many px the boards' circles, in their images, differ from their file; None where none is placed."""
-        posed = self._posed(poses, None)
-        placed = place_boards(posed.seen.observations, posed.posed_camera, self._board_file.boards, posed.seen.ellipses)
+        placed = self._posed(poses, None, rolling).placed
         return max((float(np.hypot(place.centre_sigma, place.pose_sigma)) for place in placed), default=None)
 
     def remeasured(self, images: Iterable[tuple[int, NDArray[np.uint8]]], camera: Camera) -> MetricTracker:
@@ -122,29 +125,65 @@ class MetricTracker:
         other._transforms, other._accelerations = self._transforms, self._accelerations
         return other
 
-    def _posed(self, poses: Mapping[int, FloatArray], points: Callable[[], FloatArray] | None) -> PosedEvidence:
+    def _posed(
+        self,
+        poses: Mapping[int, FloatArray],
+        points: Callable[[], FloatArray] | None,
+        rolling: RollingViews | None,
+    ) -> PosedEvidence:
         """What was seen, in pixels of one camera, at given poses."""
         cameras = Counter(self._cameras[stamp] for stamp in poses if stamp in self._cameras)
         # A camera may switch its resolution, and a robot has several: all is measured in pixels of the usual one. Noise
         # is taken to be the same number of these in every image, which is right for most of them.
         camera = cameras.most_common(1)[0][0]
+        posed = PosedEvidence(
+            self._evidence(camera, poses, self._ellipses, self._observations),
+            poses, camera, self._config, self._odometry, points,
+        )  # fmt: skip
+        return posed if rolling is None else self._unrolled(posed, rolling)
+
+    def _unrolled(self, posed: PosedEvidence, rolling: RollingViews) -> PosedEvidence:
+        """The same by ellipses as the middle row's camera has them."""
+
+        def evidence(ellipses: Mapping[int, ImageEllipses]) -> PosedEvidence:
+            boards = self._board_file.boards
+            observations = self._observations | {
+                stamp: detect_boards(ellipses[stamp], boards, self._cameras[stamp])
+                for stamp in ellipses
+                if stamp in rolling.motions
+            }
+            return replace(posed, seen=self._evidence(posed.camera, posed.poses, ellipses, observations))
+
+        def place(ellipses: Mapping[int, ImageEllipses]) -> tuple[Mapping[int, ImageEllipses], list[PlacedBoard]]:
+            current = evidence(ellipses)
+            return current.seen.ellipses or {}, [*current.placed, *scale_bar_discs(current)]
+
+        return evidence(unrolled_ellipses(self._ellipses, self._cameras, posed.poses, rolling, place))
+
+    def _evidence(
+        self,
+        camera: Camera,
+        poses: Mapping[int, FloatArray],
+        ellipses: Mapping[int, ImageEllipses],
+        observations: Mapping[int, Sequence[BoardObservation]],
+    ) -> ScaleEvidence:
+        """What was seen, in pixels of one camera."""
         other = {stamp: own for stamp, own in self._cameras.items() if own != camera}
-        seen = ScaleEvidence(
+        return ScaleEvidence(
             self._board_file,
             {
                 stamp: [one.in_pixels_of(camera, other[stamp]) for one in found] if stamp in other else found
-                for stamp, found in self._observations.items()
+                for stamp, found in observations.items()
             },
             {
                 stamp: found.in_pixels_of(camera, other[stamp]) if stamp in other else found
-                for stamp, found in self._ellipses.items()
+                for stamp, found in ellipses.items()
             },
             self._transforms,
             self._accelerations,
             self._usual_frame(poses),
             self._frames,
         )
-        return PosedEvidence(seen, poses, camera, self._config, self._odometry, points)
 
     def _usual_frame(self, poses: Mapping[int, FloatArray]) -> str:
         """The frame that is followed by odometry and IMU: the first one, unless another has twice as many keyframes.

@@ -98,6 +98,11 @@ class PosedEvidence:
         return self.seen.transforms.path(self.seen.camera_frame, list(self.own_poses)) if self.seen.transforms else None
 
     @cached_property
+    def placed(self) -> list[PlacedBoard]:
+        """The boards of the file at every place where they were seen, whether or not they agree with it."""
+        return place_boards(self.seen.observations, self.posed_camera, self.seen.board_file.boards, self.seen.ellipses)
+
+    @cached_property
     def boards(self) -> CheckedBoards:
         """The boards of the file at every place where they were seen."""
         boards = self.seen.board_file.boards
@@ -109,7 +114,7 @@ class PosedEvidence:
             text = f"no board ({names}) was identified in any of {len(self.poses)} images with a pose"
             return CheckedBoards(refused=(text,), reason="no_board")
         posed = self.posed_camera
-        placed = place_boards(self.seen.observations, posed, boards, self.seen.ellipses)
+        placed = self.placed
         if not placed:
             text = f"a board was seen in {images} images, but from too few sides to be measured"
             return CheckedBoards(refused=(text,), reason="too_few_views")

@@ -10,6 +10,7 @@ A source is a function of the evidence. SOURCES lists those of pipeprog; a furth
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
@@ -79,6 +80,15 @@ def scale_bars(posed: PosedEvidence) -> list[Measurement | ScaleWarning]:
         else:
             placed = {disc.board.name: (disc, placement_sensitivity(disc, posed.posed_camera)) for disc in discs}
             found.append(_distance_measurement(bar.distance, placed, list(posed.poses)))
+    return found
+
+
+def scale_bar_discs(posed: PosedEvidence) -> list[PlacedBoard]:
+    """The discs of all scale bars that are found."""
+    found: list[PlacedBoard] = []
+    for bar in posed.seen.board_file.scale_bars:
+        with contextlib.suppress(ScaleBarError):
+            found += find_scale_bar(bar, _free_ellipses(posed), posed.posed_camera)
     return found
 
 

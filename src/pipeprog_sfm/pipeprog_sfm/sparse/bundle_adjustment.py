@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 
+CAUCHY = 2.385  # scale of the loss in standard deviations for 95 % efficiency under normal noise (Holland, Welsch 1977)
 DIFFERENCE = 1e-3  # px, step of numerical derivatives of residuals: far above rounding (1e-12), below curvature (px)
 INITIAL_DAMPING = 1e-4  # of Levenberg-Marquardt, relative to the diagonal: nearly Gauss-Newton, as poses are near
 MAX_DAMPINGS = 6  # tenfold increases after which an iteration is given up: a damping of 100 hardly moves anything

@@ -19,6 +19,7 @@ from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, rejection_reason
+from pipeprog_sfm.sparse.row_motion import predicted
 from pipeprog_sfm.sparse.self_calibration import Refinement, refine
 from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -55,23 +56,24 @@ class Mapper:
         extract_features: Callable[[NDArray[np.uint8], Camera, MapperConfig], Features] = extract,
         retrieval: Retrieval | None = None,
         remembered: int = REMEMBERED,
+        readout: float = 0.0,
     ) -> None:
-        self.map = SparseMap()
+        self.map = SparseMap(readout)
         self._config, self._seed = config, seed
         self._extract, self._remembered = extract_features, remembered
         self._retrieval = retrieval or Retrieval()
         self._localizer = Localizer(self.map.keyframes, self._retrieval, seed)
         self._retired: dict[int, Keyframe] = {}
 
-    def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera) -> KeyframeReport:
+    def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe: (H, W) uint8 as the camera saw it, stamp in ns; features of a retired one are reused."""
         known = self._retired.pop(stamp, None)
-        features = known.features if known else self._extract(gray, camera, self._config)
-        return self.add_features(stamp, features, camera)
+        features = known.measured_features() if known else self._extract(gray, camera, self._config)
+        return self.add_features(stamp, features, camera, frame)
 
-    def add_features(self, stamp: int, features: Features, camera: Camera) -> KeyframeReport:
-        """Takes a keyframe whose features are known."""
-        keyframe = Keyframe.of(stamp, features, camera)
+    def add_features(self, stamp: int, features: Features, camera: Camera, frame: str = "") -> KeyframeReport:
+        """Takes a keyframe whose features are known; frame: of its camera."""
+        keyframe = Keyframe.of(stamp, features, camera, frame)
         self.map.keyframes[stamp] = keyframe
         report = self._register_anywhere(keyframe)
         if not report.registered:
@@ -90,7 +92,7 @@ class Mapper:
         Returns whether it has; else all stays as it was.
         """
         known = self.map.keyframes[stamp]
-        other = Keyframe.of(stamp, features, known.camera)
+        other = Keyframe.of(stamp, features, known.camera, known.frame)
         model = self.map.model_of(stamp) or min(self.map.models, key=lambda model: _gap(model, stamp), default=None)
         if model is None or len(model) < 3:
             return False
@@ -173,11 +175,14 @@ class Mapper:
     def _register(self, model: SparseModel, keyframe: Keyframe, views: IntArray, count: int | None) -> KeyframeReport:
         """In one model, by `count` features of some of its views; undone when the pose is rejected."""
         stamp = keyframe.stamp
+        if self.map.readout:
+            keyframe = predicted(model, keyframe, self.map.keyframes, self.map.readout)
+            self.map.keyframes[stamp] = keyframe
         matches = self._localizer.matches(model, keyframe, views, count)
         location = self._localizer.locate(model, keyframe, matches)
         if location.camera_from_model is None:
             return KeyframeReport(stamp, False, location.reason, 0, 0.0)
-        view = add_view(model, keyframe, location, self.map.keyframes)
+        view = add_view(model, keyframe, location, self.map.keyframes, self.map.readout)
         self.map.matches[stamp] = matches
         rejection = rejection_reason(model, view, matches)
         if rejection:
@@ -200,6 +205,8 @@ class Mapper:
             return False
         self.map.models.append(best)
         self.map.revision += 1
+        if self.map.readout:
+            self.map.adjust_globally(best)
         self.map.waiting = [stamp for stamp in self.map.waiting if stamp not in best.stamps]
         return True
 

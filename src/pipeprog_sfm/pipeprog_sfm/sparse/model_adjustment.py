@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covariance
+from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, Bundle, adjust, function_covariance
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 NOISE_RANGE = (0.1, 1.0)  # px, of a coordinate: what image noise and SIFT's localisation allow
-CAUCHY = 2.385  # scale of the loss in standard deviations for 95 % efficiency under normal noise (Holland, Welsch 1977)
 RAYLEIGH_MEDIAN = 1.1774  # median length of a 2-D normal error, in standard deviations of a coordinate
 MAX_ITERATIONS = 10  # of Levenberg-Marquardt: from poses that are known already it converges within a few
 TOLERANCE = 1e-3  # of the cost: an iteration that gains less moves the poses by less than their uncertainty

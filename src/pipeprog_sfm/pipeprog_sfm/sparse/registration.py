@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from pipeprog_sfm.features.matching import MatchArray
 from pipeprog_sfm.sparse.colmap import AbsolutePose, absolute_pose
 from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_views
+from pipeprog_sfm.sparse.row_motion import near_in_time, row_motions, unroll
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 POSE_ERROR = 4.0  # px, inlier threshold of RANSAC: points are off by a pixel or two before they are adjusted
@@ -21,6 +22,7 @@ MIN_INLIERS = 20  # of a pose: by chance one match in 18 000 lies within 4 px (o
 RIVAL = 0.5  # of a pose's inliers: if this share agrees on another pose, repeated texture makes the pose ambiguous
 MIN_SHARE = 0.25  # of the matches with the neighbours that must agree with a pose: a wrong pose has few per cent
 LOCAL_WINDOW = 8  # views that local bundle adjustment moves: those that see a point at 80 % overlap, and some more
+MOVED = 3  # views, with the new one, whose velocities a new view changes by more than a quarter of its own change
 
 
 @dataclass(frozen=True)
@@ -53,16 +55,26 @@ def locate(model: SparseModel, keyframe: Keyframe, matches: Mapping[int, MatchAr
     return Location(pose.camera_from_model, known[pose.inliers], "")
 
 
-def add_view(model: SparseModel, keyframe: Keyframe, location: Location, keyframes: Mapping[int, Keyframe]) -> int:
+def add_view(
+    model: SparseModel,
+    keyframe: Keyframe,
+    location: Location,
+    keyframes: MutableMapping[int, Keyframe],
+    readout: float = 0.0,
+) -> int:
     """Adds a located keyframe: its pose, then tracks and local adjustment; returns its view.
 
-    keyframes: at least those of the model's views and this one, by stamp.
+    keyframes: at least those of the model's views and this one, by stamp; with a readout [s], this one and its
+    neighbours get the features of the middle row's camera.
     """
     assert location.camera_from_model is not None
     used = location.pairs
     view = model.add_view(keyframe.stamp, keyframe.rays, keyframe.focal, location.camera_from_model)
     first = np.unique(used[:, 0], return_index=True)[1]
     model.point_of[model.offsets[view] + used[first, 0]] = used[first, 1]
+    if readout:
+        near = near_in_time(model, keyframe.stamp)
+        unroll(model, keyframes, row_motions(model, keyframes, readout, near, MOVED))
     link(model, view, keyframes)
     _adjust_around(model, view)
     return view

@@ -19,8 +19,7 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import CalibrationConfig
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
-from pipeprog_sfm.sparse.model_adjustment import CAUCHY
+from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, rotation_from_vector
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map

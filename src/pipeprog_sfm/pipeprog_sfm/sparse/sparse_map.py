@@ -9,16 +9,20 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
 from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_points, pose_covariance
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
 from pipeprog_sfm.sparse.registration import rejection_reason
+from pipeprog_sfm.sparse.row_motion import row_motions, unroll
 from pipeprog_sfm.sparse.self_calibration import RADII, radial_residuals
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 ERROR_SAMPLE = 20_000  # observations that give the mean error: with a spread of 1 px, to 1 / sqrt(20 000) = 0.007 px
+MAX_TURNS = 3  # of shifts and poses after a global adjustment; a map that grows goes on at the next one
+SETTLED = 0.02  # px; a change of all features of a view by less moves its pose by less than their noise (0.3 px / 20)
 
 
 class SparseMap:
@@ -29,10 +33,12 @@ class SparseMap:
         waiting: stamps of those without a pose, in the order in which they came.
         models: not connected with each other; the one chosen by `publish`, else the largest, is the published one.
         matches: by stamp of a registered keyframe, its matches with other keyframes by their stamps.
+        readout: from the first row of an image to the last, s; 0: all rows at once.
         revision: grows whenever poses of earlier keyframes may have moved as a whole.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, readout: float = 0.0) -> None:
+        self.readout = readout
         self.keyframes: dict[int, Keyframe] = {}
         self.waiting: list[int] = []
         self.models: list[SparseModel] = []
@@ -85,6 +91,8 @@ class SparseMap:
     def adjust_globally(self, model: SparseModel) -> None:
         """Adjusts all views of a model; views whose poses are rejected afterwards wait again."""
         adjust_model(model)
+        if self.readout:
+            self._adjust_rolling(model)
         for view in reversed(range(len(model))):
             if len(model) > 2 and rejection_reason(model, view, self.matches.get(model.stamps[view], {})):
                 self.waiting.append(model.stamps[view])
@@ -106,6 +114,17 @@ class SparseMap:
             for view in range(len(model)):
                 link(model, view, self.keyframes)
             self.adjust_globally(model)
+
+    def motions(self, model: SparseModel) -> dict[int, RowMotion]:
+        """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout."""
+        return row_motions(model, self.keyframes, self.readout) if self.readout else {}
+
+    def _adjust_rolling(self, model: SparseModel) -> None:
+        """Finds the shifts of features and the poses in turns, until the shifts stay."""
+        for _ in range(MAX_TURNS):
+            if unroll(model, self.keyframes, self.motions(model)) < SETTLED:
+                return
+            adjust_model(model)
 
     def camera_from_model(self) -> dict[int, FloatArray]:
         """Poses (4, 4) of the published model's keyframes, in order of time."""

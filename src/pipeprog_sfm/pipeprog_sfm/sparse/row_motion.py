@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rolling shutter of a sparse model: how each view moves, and its features where the middle row's camera has them.
+
+The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
+are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
+(Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). The ends of the
+trajectory, where a spline is poor, are corrected by what their own rows tell.
+
+Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
+that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
+T seconds comes back through the velocities multiplied by pi * readout / T, a tenth where keyframes are 0.2 s apart and
+the read-out is 15 ms: three turns do.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, MutableMapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_camera.rolling_shutter import RowMotion
+from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY
+from pipeprog_sfm.sparse.sparse_model import SparseModel
+
+MAX_GAP = 1.0  # s between two views that still tell the velocity between them: a hand sways at 1 to 2 Hz
+MIN_GAP = 0.02  # s between two knots: poses are known to 0.3 mm, and their difference over it to 0.02 m/s
+NEAR = 16  # views nearest in time that tell how one moves: a knot has a quarter of the say of the one before
+# rad/s and depths of the scene per second, for each second to the next pose: how far the velocity at an end of the
+# spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
+END_CHANGE = 1.0
+MIN_POINTS = 50  # of a view, from which its own rows tell its velocity: twelve unknowns, and some wrong points
+
+
+def row_motions(
+    model: SparseModel,
+    keyframes: Mapping[int, Keyframe],
+    readout: float,
+    near: IntArray | None = None,
+    count: int | None = None,
+) -> dict[int, RowMotion]:
+    """How the model moves as seen from its views, by stamp; left out where it is unknown.
+
+    Lengths are in the unit of the model. Each camera of a rig has a trajectory of its own. With `near`, the trajectory
+    is that of these views alone, and the motions are those of the first `count` of them.
+    """
+    views = np.arange(len(model)) if near is None else near
+    wanted = set(views[:count].tolist())
+    by_camera: defaultdict[object, list[int]] = defaultdict(list)
+    for view in views.tolist():
+        keyframe = keyframes[model.stamps[view]]
+        by_camera[keyframe.frame, keyframe.camera].append(view)
+    centres = model.centres()
+    found: dict[int, RowMotion] = {}
+    for members in by_camera.values():
+        order = np.array(sorted(members, key=model.stamps.__getitem__))
+        stamps = np.array([model.stamps[view] for view in order], np.int64)
+        ends = np.flatnonzero(np.diff(stamps) > MAX_GAP * 1e9) + 1
+        for part in np.split(order, ends):
+            own = [model.stamps[view] for view in part]
+            linear, angular = _velocities(own, model.rotation[part], centres[part])
+            gaps = np.diff(own, prepend=own[0], append=own[-1]) * 1e-9
+            for number, (shift, turn) in enumerate(zip(linear, angular, strict=True)):
+                if part[number] not in wanted:
+                    continue
+                keyframe = keyframes[own[number]]
+                motion = RowMotion(readout, keyframe.camera.height, shift, turn)
+                if number in (0, len(own) - 1):
+                    sigma = END_CHANGE * max(gaps[number], gaps[number + 1])
+                    motion = _fitted(model, int(part[number]), keyframe, motion, sigma)
+                found[own[number]] = motion
+    return found
+
+
+def unroll(model: SparseModel, keyframes: MutableMapping[int, Keyframe], motions: Mapping[int, RowMotion]) -> float:
+    """Gives the model's views of `motions` (by stamp) and their keyframes the features of the middle row's camera.
+
+    A feature without a point is shifted as if at the depth of the nearest one in the image that has one. Returns the
+    largest root mean square over a view of the change of its features, px.
+    """
+    change = 0.0
+    for stamp, motion in motions.items():
+        view = model.stamps.index(stamp)
+        depths = feature_depths(model, view, keyframes[stamp])
+        if depths is None:
+            continue
+        before = keyframes[stamp].rays
+        keyframes[stamp] = keyframe = keyframes[stamp].unrolled(motion, depths)
+        model.rays[model.features(view)] = keyframe.rays
+        moved = (keyframe.rays - before) * keyframe.focal
+        change = max(change, float(np.sqrt((moved**2).sum(axis=1).mean())))
+    return change
+
+
+def predicted(model: SparseModel, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], readout: float) -> Keyframe:
+    """The keyframe with features unrolled as if it moved like the view of its camera that is nearest in time."""
+    near = near_in_time(model, keyframe.stamp)
+    first = int(near[0])
+    nearest = keyframes[model.stamps[first]]
+    motion = row_motions(model, keyframes, readout, near, 1).get(nearest.stamp)
+    seen = model.points[model.seen(first)]
+    another = (nearest.frame, nearest.camera) != (keyframe.frame, keyframe.camera)
+    if another or motion is None or not len(seen) or abs(nearest.stamp - keyframe.stamp) > MAX_GAP * 1e9:
+        return keyframe
+    depth = np.median(seen @ model.rotation[first, 2]) + model.translation[first, 2]
+    return keyframe.unrolled(motion, np.full(len(keyframe.measured), depth))
+
+
+def near_in_time(model: SparseModel, stamp: int) -> IntArray:
+    """The NEAR views nearest in time to a stamp, the nearest first."""
+    return np.argsort(np.abs(np.array(model.stamps) - stamp), kind="stable")[:NEAR]
+
+
+def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatArray | None:
+    """(N,) depths of a view's features: of their points, or of the nearest feature with one; None without any."""
+    own = model.point_of[model.features(view)]
+    has = own >= 0
+    depths = model.points[own[has]] @ model.rotation[view, 2] + model.translation[view, 2]
+    if not (depths > 0).any():
+        return None
+    tree = cKDTree(keyframe.measured[has][depths > 0])
+    return np.asarray(depths[depths > 0][tree.query(keyframe.measured)[1]])
+
+
+def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion, sigma: float) -> RowMotion:
+    """The motion that fits the view's points best, with that of the spline as the prior and the pose as it may be.
+
+    sigma: standard deviation of the spline's velocities, rad/s, and depths of the scene per second. One Gauss-Newton
+    step for pose and velocity, twelve unknowns: the columns of the velocity are those of the pose times the row's time.
+    """
+    features = np.flatnonzero(model.point_of[model.features(view)] >= 0)
+    inside = model.points[model.point_of[model.features(view)][features]] @ model.rotation[view].T
+    inside += model.translation[view]
+    ahead = inside[:, 2] > 0
+    features, inside = features[ahead], inside[ahead]
+    if len(features) < MIN_POINTS:
+        return motion
+    camera = keyframe.camera
+    measured = keyframe.measured[features].astype(np.float64)
+    x, y, z = inside.T
+    shown = np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
+    error = motion.unrolled_pixels(measured, z, camera) - shown
+    by_point = np.zeros((len(z), 2, 3))
+    by_point[:, 0, 0], by_point[:, 1, 1] = camera.fx / z, camera.fy / z
+    by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
+    by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
+    times = motion.row_times(camera.distort_points(measured)[:, 1])[:, None, None]
+    rows = np.concatenate([by_pose, times * by_pose], axis=2)
+    weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * model.noise) ** 2) / model.noise**2
+    normal = np.einsum("n,nij,nik->jk", weights, rows, rows)
+    depth = float(np.median(z))
+    normal[np.arange(6, 12), np.arange(6, 12)] += 1.0 / (sigma * np.repeat([1.0, depth], 3)) ** 2
+    change = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weights, rows, error))[6:]
+    return replace(motion, angular=motion.angular + change[:3], linear=motion.linear + change[3:])
+
+
+def _velocities(stamps: list[int], rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(V, 3) linear and (V, 3) angular velocities of the model as seen from cameras at ascending stamps, ns.
+
+    Empty for one view. rotations (V, 3, 3) camera_from_model, centres (V, 3).
+    """
+    times = (np.array(stamps) - stamps[0]) * 1e-9
+    knots = _apart(times)
+    if len(knots) < 2:
+        return np.empty((0, 3)), np.empty((0, 3))
+    turns = _unit_quaternions(rotations.transpose(0, 2, 1))
+    # Without acceleration at the ends: a spline whose ends are free doubles the error of its last velocities.
+    spline = CubicSpline(times[knots], np.c_[centres, turns][knots], bc_type="natural")
+    rate = spline(times, 1)
+    # q' = q w / 2 with the angular velocity w in the camera's frame; what is along q changes its length alone.
+    own_turn = 2.0 * (Rotation.from_quat(turns).inv().as_matrix() @ _imaginary(turns, rate[:, 3:])[..., None])[..., 0]
+    return -np.einsum("vij,vj->vi", rotations, rate[:, :3]), -own_turn
+
+
+def _unit_quaternions(rotations: FloatArray) -> FloatArray:
+    """(V, 4) quaternions x, y, z, w of (V, 3, 3) rotations, each with the sign nearest to the one before."""
+    turns = Rotation.from_matrix(rotations).as_quat()
+    signs = np.cumprod(np.r_[1.0, np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)])
+    return np.asarray(turns * signs[:, None])
+
+
+def _imaginary(turns: FloatArray, rates: FloatArray) -> FloatArray:
+    """(V, 3) imaginary part of rates times the conjugates of turns, quaternions x, y, z, w (V, 4)."""
+    vector, scalar = turns[:, :3], turns[:, 3:]
+    return np.asarray(scalar * rates[:, :3] - rates[:, 3:] * vector - np.cross(rates[:, :3], vector))
+
+
+def _apart(times: FloatArray) -> NDArray[np.intp]:
+    """Indices of ascending times that are MIN_GAP apart, from the first one."""
+    kept: list[int] = []
+    for index, time in enumerate(times):
+        if not kept or time - times[kept[-1]] >= MIN_GAP:
+            kept.append(index)
+    return np.array(kept, np.intp)

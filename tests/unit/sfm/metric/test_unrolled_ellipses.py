@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards seen through a rolling shutter."""
+
+from __future__ import annotations
+
+import numpy as np
+from targets import BOARD, CAMERA, camera_from_board, exact_ellipses
+
+from pipeprog_camera.rolling_shutter import RowMotion
+from pipeprog_sfm.boards.board_detection import detect_boards
+from pipeprog_sfm.boards.ellipses import PROFILES, ImageEllipses, fit_ellipses, rim_points
+from pipeprog_sfm.boards.placed_board import BoardView, PlacedBoard
+from pipeprog_sfm.metric.unrolled_ellipses import RollingViews, unrolled_ellipses
+
+MOTION = RowMotion(0.03, CAMERA.height, np.array([-0.8, 0.1, 0.05]), np.array([0.05, -0.2, 0.1]))
+
+
+def rolled(ellipses: ImageEllipses, pose: np.ndarray) -> ImageEllipses:
+    """What the rolling camera sees of ellipses on the board's plane."""
+    rims = rim_points(ellipses.centres, ellipses.shapes)[0].reshape(-1, 2)
+    rays = np.c_[(rims - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones(len(rims))]
+    inside = rays * (pose[:3, 2] @ pose[:3, 3] / (rays @ pose[:3, 2]))[:, None]
+    shown = MOTION.rolled_pixels(rims, inside, CAMERA).reshape(-1, PROFILES, 2)
+    centres, shapes, rms, _ = fit_ellipses(shown, np.ones(shown.shape[:2]))
+    return ImageEllipses(centres, shapes, rms)
+
+
+def test_circles_are_unrolled_by_the_plane_of_their_board() -> None:
+    pose = camera_from_board((0.5, 0.1, 1.4), (0.0, 0.0, 0.0))
+    true = exact_ellipses([BOARD], [pose])
+    seen = rolled(true, pose)
+    assert np.abs(seen.centres - true.centres).max() > 1.0
+    near_wall = np.array([[0.0, 0.0, -0.1], [0.3, 0.2, -0.1], [-0.3, -0.2, -0.1]])
+
+    def place(ellipses):
+        views = tuple(BoardView(7, found) for found in detect_boards(ellipses[7], [BOARD], CAMERA))
+        assert len(views) == 1
+        return ellipses, [PlacedBoard(BOARD, views, np.eye(4), 0.0, 0.03, 0.1)]
+
+    found = unrolled_ellipses(
+        {7: seen, 8: seen}, {7: CAMERA, 8: CAMERA}, {7: pose}, RollingViews({7: MOTION}, lambda _: near_wall), place
+    )
+    # What the wall behind the board would give is a tenth of a pixel off.
+    np.testing.assert_allclose(found[7].centres, true.centres, atol=0.02)
+    np.testing.assert_allclose(found[7].axes, true.axes, atol=0.02)
+    assert found[8] is seen

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A walk along the synthetic corner through a rolling shutter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import CAMERA, STEP, pose, position_errors, view
+
+from pipeprog_camera.rolling_shutter import RowMotion
+from pipeprog_sfm.config import MapperConfig
+from pipeprog_sfm.sparse.mapper import Mapper
+
+READOUT = 0.03  # s
+SPEED = 0.8  # m/s
+TICK = 1e-4  # s of numerical derivatives
+
+
+def camera_at(time: float) -> NDArray[np.float64]:
+    """camera_from_world of a walk that sways at 0.4 Hz."""
+    return pose(SPEED * time, 0.1 * np.sin(2.5 * time))
+
+
+def motion_at(time: float) -> RowMotion:
+    before, now, after = (camera_at(time + step) for step in (-TICK, 0.0, TICK))
+    rate = (after - before) / (2 * TICK)
+    spin = rate[:3, :3] @ now[:3, :3].T
+    angular = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
+    return RowMotion(READOUT, CAMERA.height, rate[:3, 3] - np.cross(angular, now[:3, 3]), angular)
+
+
+def walk(readout: float) -> tuple[Mapper, dict[int, NDArray[Any]]]:
+    """What a mapper makes of images with a read-out of 30 ms, when it is told one."""
+    mapper = Mapper(MapperConfig(), readout=readout)
+    truth = {}
+    for n in range(9):
+        time = n * STEP * 1e-9
+        truth[n * STEP] = camera_at(time)
+        mapper.add_features(n * STEP, view(truth[n * STEP], n, motion=motion_at(time)), CAMERA)
+    mapper.finish()
+    return mapper, truth
+
+
+@pytest.fixture(scope="module")
+def told() -> tuple[Mapper, dict[int, NDArray[Any]]]:
+    return walk(READOUT)
+
+
+def test_the_path_is_that_of_a_global_shutter(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    mapper, truth = told
+    poses = mapper.map.camera_from_model()
+    assert list(poses) == sorted(truth)
+    # As the same walk with a global shutter in test_mapper; ends of the walk are held by their own rows alone.
+    assert position_errors(poses, truth).max() < 2e-3
+    assert 0.25 < mapper.map.reprojection_error() < 0.45
+
+
+def test_without_the_readout_the_path_is_bent() -> None:
+    mapper, truth = walk(0.0)
+    assert position_errors(mapper.map.camera_from_model(), truth).max() > 5e-3
+    assert mapper.map.motions(mapper.map.published) == {}
+
+
+def test_velocities_are_those_of_the_walk(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    mapper, truth = told
+    poses, motions = mapper.map.camera_from_model(), mapper.map.motions(mapper.map.published)
+    spread = [np.std([-p[:3, :3].T @ p[:3, 3] for p in each.values()], axis=0) for each in (truth, poses)]
+    scale = np.linalg.norm(spread[0]) / np.linalg.norm(spread[1])
+    for stamp in list(poses)[1:-1]:
+        true = motion_at(stamp * 1e-9)
+        # 0.02 m/s and rad/s move a pixel by 0.3 px within the 15 ms to the last row.
+        np.testing.assert_allclose(scale * motions[stamp].linear, true.linear, atol=0.02)
+        np.testing.assert_allclose(motions[stamp].angular, true.angular, atol=0.02)
+
+
+def test_a_keyframe_that_comes_back_has_its_measured_features(
+    told: tuple[Mapper, dict[int, NDArray[Any]]],
+) -> None:
+    keyframe = told[0].map.keyframes[5 * STEP]
+    assert np.abs(keyframe.features.keypoints - keyframe.measured).max() > 1.0
+    assert (keyframe.measured_features().keypoints == keyframe.measured).all()
