@@ -16,7 +16,7 @@ ifneq ($(shell cat $(VENV)/.home 2>/dev/null),$(CURDIR))
 .PHONY: $(VENV)/.home
 endif
 
-INTERFACES := $(wildcard src/pipeprog_msgs/msg/*.msg src/pipeprog_msgs/srv/*.srv)
+INTERFACES := $(wildcard src/pipeprog_msgs/msg/*.msg src/pipeprog_msgs/srv/*.srv src/pipeprog_msgs/action/*.action)
 PACKAGES := $(wildcard src/*/package.xml src/*/setup.py src/*/setup.cfg src/*/CMakeLists.txt src/*/launch/* src/*/config/*)
 
 help: ## this list

@@ -24,5 +24,7 @@ setup(
     maintainer_email="maintainers@pipeprog.dev",
     description="Launch files, parameter presets, the command pipeprog, replay of recordings and the progress report.",
     license="Apache-2.0",
-    entry_points={"console_scripts": ["pipeprog = pipeprog_bringup.cli:main"]},
+    entry_points={
+        "console_scripts": ["pipeprog = pipeprog_bringup.cli:main", "survey_node = pipeprog_bringup.survey.node:main"]
+    },
 )

@@ -39,9 +39,13 @@ GLUE = {
         "messages",
         "main",
         "received",
+        "renewal",
         "worker",
     },
-    "pipeprog_bringup": {"replay", "session", "connections", "player", "listener", "survey_writer"},
+    "pipeprog_bringup": {
+        *{"replay", "session", "connections", "player", "listener", "survey_writer"},
+        *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output"},
+    },
 }
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
 # and all may import config.py and types.py.
@@ -71,6 +75,7 @@ FOLDERS = {
             *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
             *("console", "footage", "plane_from_keyframe", "recording", "recording_check", "comparison"),
         },
+        "survey": {"playback", "recording", "results"},
     },
 }
 LICENCE = "# SPDX-License-Identifier: Apache-2.0"

@@ -10,8 +10,9 @@ import os
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch_ros.actions import LifecycleNode, Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 ARGUMENTS = [
@@ -57,6 +58,16 @@ ARGUMENTS = [
         default_value=os.path.join(get_package_share_directory("pipeprog_bringup"), "config", "default.yaml"),
         description="Settings of the nodes; config/spot.yaml beside the default is for Spot-style robots.",
     ),
+    DeclareLaunchArgument(
+        "survey",
+        default_value="false",
+        choices=["true", "false"],
+        description="Start the managed node survey, too: images are taken while its action runs. "
+        "false: one survey, from the first image on.",
+    ),
+    DeclareLaunchArgument(
+        "results", default_value="surveys", description="Folder in which each survey of the action gets its folder."
+    ),
     DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
     DeclareLaunchArgument(
         "enclaves",
@@ -81,18 +92,40 @@ ARGUMENTS = [
 
 def pipeprog_node(name: str, parameters: dict, remappings: list) -> Node:
     """One node of the graph; what `parameters` says goes before the parameter file."""
-    use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     return Node(
         package=f"pipeprog_{name}",
         executable=f"{name}_node",
         name=name,
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time, **parameters}],
+        parameters=[LaunchConfiguration("params_file"), {"use_sim_time": truth("use_sim_time"), **parameters}],
         remappings=remappings,
         ros_arguments=[
             *("--log-level", LaunchConfiguration("log_level")),
             *("--enclave", [LaunchConfiguration("enclaves"), "/", name]),
         ],
+        output="screen",
+    )
+
+
+def truth(argument: str) -> ParameterValue:
+    """The argument as a parameter that is true or false."""
+    return ParameterValue(LaunchConfiguration(argument), value_type=bool)
+
+
+def survey_node(remappings: list) -> LifecycleNode:
+    """The managed node of the action; it is configured and activated by a lifecycle manager, or by hand."""
+    files = {name: text(name) for name in ("boq", "board")}
+    return LifecycleNode(
+        package="pipeprog_bringup",
+        executable="survey_node",
+        name="survey",
+        namespace=LaunchConfiguration("namespace"),
+        condition=IfCondition(LaunchConfiguration("survey")),
+        parameters=[
+            LaunchConfiguration("params_file"),
+            {"results": text("results"), "use_sim_time": truth("use_sim_time"), **files},
+        ],
+        remappings=remappings,
         output="screen",
     )
 
@@ -113,8 +146,9 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *ARGUMENTS,
-            pipeprog_node("frames", {"image_transport": text("image_transport")}, camera),
+            pipeprog_node("frames", {"image_transport": text("image_transport"), "idle": truth("survey")}, camera),
             pipeprog_node("sfm", {"board": text("board")}, motion),
             pipeprog_node("detect", {"boq": text("boq")}, []),
+            survey_node(camera + motion),
         ]
     )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -181,8 +182,8 @@ class PipeOutput:
 class DetectNode(Node):
     """Adapter around the worker process that runs the detector."""
 
-    def __init__(self) -> None:
-        super().__init__("detect")
+    def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
+        super().__init__("detect", parameter_overrides=list(overrides))
         config = declare(self, DetectConfig, extra=("boq", "intermediate"))
         path = declare_fixed(self, "boq", "", "file of the bill of quantities")
         if not path:
@@ -414,7 +415,7 @@ def _progress_msg(row: ClassProgress, product: Product, boq: BillOfQuantities) -
 
 def main() -> None:
     """Entry point of detect_node."""
-    run(DetectNode)
+    run(DetectNode, renewed=("boq",))
 
 
 if __name__ == "__main__":

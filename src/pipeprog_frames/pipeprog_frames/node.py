@@ -10,6 +10,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from pipeprog_camera.camera import Camera
@@ -30,7 +31,7 @@ from pipeprog_node.discovery import stages_subscribed
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake
 from pipeprog_node.main import run
-from pipeprog_node.parameters import declare
+from pipeprog_node.parameters import declare, declare_fixed
 
 STAGES = 2  # nodes of the graph that take keyframes: SfM and detector
 
@@ -97,8 +98,20 @@ class FrameInput:
         on_image: Callable[[Arrival], None],
         on_calibration: Callable[[tuple[int, Camera | None]], None],
         on_answer: Callable[[Answer], None],
+        idle: bool,
     ) -> None:
+        """`idle`: without the topics of the camera."""
         self.intake = Intake(node)
+        self._overlaps = self.intake.subscribe(ImageOverlapArray, "image_overlap", _answer, on_answer, qos.reliable(50))
+        if not idle:
+            self._subscribe_camera(config, on_image, on_calibration)
+
+    def _subscribe_camera(
+        self,
+        config: FramesConfig,
+        on_image: Callable[[Arrival], None],
+        on_calibration: Callable[[tuple[int, Camera | None]], None],
+    ) -> None:
         # Live, a late image is worth less than a fresh one; a recording must lose none.
         source = qos.reliable(MAX_QUEUE) if config.lockstep else qos.sensor(10)
         subscribe = partial(self.intake.subscribe, profile=source, overriding=qos.OVERRIDABLE)
@@ -107,7 +120,6 @@ class FrameInput:
             subscribe(CompressedImage, "image/compressed", partial(self._arrival, "image/compressed"), on_image)
         if config.image_transport != "compressed":
             subscribe(Image, "image", partial(self._arrival, "image"), on_image)
-        self._overlaps = self.intake.subscribe(ImageOverlapArray, "image_overlap", _answer, on_answer, qos.reliable(50))
 
     @property
     def is_connected(self) -> bool:
@@ -134,9 +146,10 @@ class FrameInput:
 class FramesNode(Node):
     """Adapter around a Selection."""
 
-    def __init__(self) -> None:
-        super().__init__("frames")
-        self._config = declare(self, FramesConfig)
+    def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
+        super().__init__("frames", parameter_overrides=list(overrides))
+        self._config = declare(self, FramesConfig, extra=("idle",))
+        idle = declare_fixed(self, "idle", False, "take no images, until a survey begins")
         if self._config.policy == "network" and not self._config.lockstep:
             raise InputError("policy = network takes a whole recording: use it with `pipeprog replay`, live use stream")
         self._selection = Selection(self._config)
@@ -145,11 +158,11 @@ class FramesNode(Node):
         self._ledger = Ledger(exact=self._config.lockstep)
         self._considered = self._dropped = 0
         self._faults: Counter[str] = Counter()  # images refused, by the beginning of the reason
-        self._flushed = False
+        self._flushed = self._is_over = False
         self._frame_id = ""  # of the camera, as its last image says
 
         self._publisher = KeyframePublisher(self)
-        self._input = FrameInput(self, self._config, self._on_image, self._on_calibration, self._on_answer)
+        self._input = FrameInput(self, self._config, self._on_image, self._on_calibration, self._on_answer, idle)
         if self._config.lockstep:
             self._connecting = self.create_timer(0.1, self._start_when_connected)
         self._finish = FinishService(self, lambda: self._considered + len(self._queue), self._on_finish)
@@ -160,6 +173,8 @@ class FramesNode(Node):
         self._drain()
 
     def _on_image(self, arrival: Arrival) -> None:
+        if self._finish.is_due or self._is_over:
+            return  # the survey ended with the images before: a camera goes on for ever
         dropped = self._queue.push(arrival)
         self._dropped += len(dropped)
         reason = "dropped: newer images had come" if self._selection.calibrations.newest else UNCALIBRATED
@@ -224,6 +239,7 @@ class FramesNode(Node):
         return waited and not self._config.lockstep
 
     def _end(self) -> None:
+        self._is_over = True
         outside = self._selection.report_outside_band()
         for decision in outside:
             self._publisher.announce(decision, self._frame_id)
@@ -324,7 +340,7 @@ def _answer(message: ImageOverlapArray) -> Answer:
 
 def main() -> None:
     """Entry point of frames_node."""
-    run(FramesNode)
+    run(FramesNode, renewed=("idle",))
 
 
 if __name__ == "__main__":

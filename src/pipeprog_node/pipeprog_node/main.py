@@ -6,21 +6,23 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Collection
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import for_terminal
+from pipeprog_node.renewal import MakeNode, RenewableNode
 
 STOP_LATENCY = 0.1  # [s] at most from a signal to the end of a node to which no message comes
 
 
-def run(node_type: Callable[[], Node]) -> None:
+def run(node_type: MakeNode, renewed: Collection[str] = ()) -> None:
     """Runs the node until SIGINT or SIGTERM.
+
+    `renewed`: the fields of pipeprog_msgs/Renew that are parameters of the node; with them, it offers `~/renew`.
 
     The process exits with 0 after SIGINT or SIGTERM, and with 1 and one line on stderr after an InputError.
     """
@@ -35,15 +37,15 @@ def run(node_type: Callable[[], Node]) -> None:
     node = None
     problem = None
     try:
-        node = node_type()
         executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        node = RenewableNode(node_type, executor, renewed)
         while not stop.is_set():
             executor.spin_once(timeout_sec=STOP_LATENCY)
+            node.renew_if_asked()
     except InputError as error:
         problem = for_terminal(f"error: {error}")
     finally:
         if node is not None:
-            node.destroy_node()
+            node.destroy()
         rclpy.try_shutdown()
     sys.exit(problem)

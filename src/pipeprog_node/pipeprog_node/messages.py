@@ -7,7 +7,7 @@ from array import array
 
 import cv2
 import numpy as np
-from builtin_interfaces.msg import Time
+from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
@@ -60,6 +60,17 @@ def time_msg(stamp: int) -> Time:
     """Stamp of nanoseconds; also of those that stamp_ns has made of a stamp whose nanoseconds exceed a second."""
     sec = min(stamp // SECOND, MAX_SECONDS)
     return Time(sec=sec, nanosec=stamp - sec * SECOND)
+
+
+def duration_msg(seconds: float) -> Duration:
+    """A duration [s], not negative."""
+    nanoseconds = round(1e9 * seconds)
+    return Duration(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+
+
+def seconds(duration: Duration) -> float:
+    """Seconds of a duration."""
+    return float(duration.sec + 1e-9 * duration.nanosec)
 
 
 def header(stamp: int, frame_id: str) -> Header:

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Imu, PointCloud2
 from std_msgs.msg import Header
@@ -251,8 +252,8 @@ class MapOutput:
 class SfmNode(Node):
     """Converts messages to commands of the reconstruction's process, and its events to messages."""
 
-    def __init__(self) -> None:
-        super().__init__("sfm")
+    def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
+        super().__init__("sfm", parameter_overrides=list(overrides))
         config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep", "intermediate"))
         board = declare_fixed(self, "board", "", "file of the boards on site")
         intermediate = declare_fixed(
@@ -415,7 +416,7 @@ class SfmNode(Node):
 
 def main() -> None:
     """Entry point of sfm_node."""
-    run(SfmNode)
+    run(SfmNode, renewed=("board", "colmap"))
 
 
 if __name__ == "__main__":

@@ -9,17 +9,17 @@ from rclpy.node import Node
 
 from pipeprog_node.discovery import publishers, subscribers
 
-# Topic -> the nodes that subscribe to it, the command's own node `replay` included. What is published before a
-# subscriber is found would never reach it.
+LISTENER = ""  # stands for the node that conducts the survey, whatever its name
+# Topic -> the nodes that subscribe to it. What is published before a subscriber is found would never reach it.
 SUBSCRIBERS = {
     "keyframes/image/compressed": {"sfm", "detect"},
     "keyframes/camera_info": {"sfm", "detect"},
-    "image_overlap": {"frames", "replay"},
+    "image_overlap": {"frames", LISTENER},
     "map_points": {"detect"},
     "keyframe_poses": {"detect"},
     "keyframe_velocities": {"detect"},
-    "sfm_status": {"detect", "replay"},
-    "frame_decisions": {"replay"},
+    "sfm_status": {"detect", LISTENER},
+    "frame_decisions": {LISTENER},
 }
 PUBLISHERS = {
     "frame_decisions": "frames",
@@ -36,7 +36,7 @@ def missing_connections(node: Node, to_frames: Iterable[str], to_sfm: Iterable[s
     missing = [
         f"{name} does not subscribe to {topic}"
         for topic, names in wanted.items()
-        for name in sorted(names - subscribers(node, topic))
+        for name in sorted({name or node.get_name() for name in names} - subscribers(node, topic))
     ]
     missing += [
         f"{name} does not publish {topic}" for topic, name in PUBLISHERS.items() if name not in publishers(node, topic)

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_frames.frame_decision import FAULTS
 
+LOST_AFTER = 3  # keyframes in a row without a place in the map: one may be blurred, two may be its neighbours
+
 
 class FrameLog:
     """Rows of frames.csv in the order of playing, filled by the decisions and the SfM's feedback as they come."""
@@ -105,3 +107,25 @@ class FrameLog:
         """The reason of a frame, and which one it is, where the reason tells more than its kind."""
         reason = self._reason(number)
         return f"{reason} (frame {number + 1}, the first of them)" if ": " in reason else reason
+
+
+class LiveFrameLog(FrameLog):
+    """The frames of a camera: nobody says that one was sent, so it is known by its first decision."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last_keyframes: deque[int] = deque(maxlen=LOST_AFTER)
+
+    @property
+    def is_tracking(self) -> bool:
+        """Whether one of the last keyframes has a place in the map, or is not worked off yet."""
+        last = list(self._last_keyframes)
+        return len(last) < LOST_AFTER or any(stamp not in self._overlap or self._overlap[stamp][3] for stamp in last)
+
+    def decide(self, row: FrameRow) -> None:
+        """A decision came; a second one about the same frame replaces the first."""
+        if row.stamp not in self._first:
+            self.play(row.stamp)
+        if row.chosen and row.stamp not in self._last_keyframes:
+            self._last_keyframes.append(row.stamp)
+        super().decide(row)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Transform, TransformStamped, Vector3
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
 from pipeprog_bringup.playback.frame_log import FrameLog
@@ -72,7 +72,7 @@ def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmSta
     stamp = messages.stamp_ns(survey.poses.poses[0].header.stamp)
     recorded = [(topic, getattr(survey, name)) for name, topic in _SURVEY_TOPICS.items()] + [("sfm_status", status)]
     for topic, message in recorded:
-        recording.write(f"/{topic}", _type_name(type(message)), serialize_message(message), stamp, latched=True)
+        recording.write(f"/{topic}", type_name(type(message)), serialize_message(message), stamp, latched=True)
 
 
 def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: LastMessages) -> dict[int, Camera]:
@@ -80,9 +80,7 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: Last
 
     Returns their cameras by stamp.
     """
-    cameras = {}
-    places = {messages.stamp_ns(place.header.stamp): place for place in survey.poses.poses}
-    refined = None if survey.refined is None else messages.camera_from_info(survey.refined)
+    infos = {}
     chosen = {row.stamp for row in log.rows() if row.chosen}
     for frame in bag:
         if frame.stamp not in chosen or frame.fault:
@@ -92,14 +90,26 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: Last
         if bag.image_type == cdr.IMAGE:
             encoded = messages.encode_jpeg(messages.image_from_msg(deserialize_message(data, Image)))
             data = cdr.write_compressed_image(frame.stamp, frame.frame_id, "jpeg", encoded)
-        used = messages.info_from_camera(refined, frame.stamp, frame.frame_id) if refined else calibration(frame)
-        info = serialize_message(used)
-        cameras[frame.stamp] = cdr.read_camera_info(info).camera()
-        recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, info, frame.stamp)
+        infos[frame.stamp] = calibration(frame)
         recording.write("/keyframes/image/compressed", cdr.COMPRESSED_IMAGE, data, frame.stamp)
-        if frame.stamp in places:
-            moved = _transform(places[frame.stamp], frame.frame_id)
-            recording.write("/tf", cdr.TF, serialize_message(moved), frame.stamp)
+    return record_cameras(recording, survey, infos)
+
+
+def record_cameras(recording: BagWriter, survey: LastMessages, infos: Mapping[int, CameraInfo]) -> dict[int, Camera]:
+    """Write calibration and transform of the keyframes in out.mcap; returns their cameras by stamp.
+
+    `infos`: the calibrations that were sent with them, by stamp; what the survey has refined goes before.
+    """
+    cameras = {}
+    places = {messages.stamp_ns(place.header.stamp): place for place in survey.poses.poses}
+    refined = None if survey.refined is None else messages.camera_from_info(survey.refined)
+    for stamp, sent in infos.items():
+        used = messages.info_from_camera(refined, stamp, sent.header.frame_id) if refined else sent
+        cameras[stamp] = messages.camera_from_info(used)
+        recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, serialize_message(used), stamp)
+        if stamp in places:
+            moved = _transform(places[stamp], sent.header.frame_id)
+            recording.write("/tf", cdr.TF, serialize_message(moved), stamp)
     return cameras
 
 
@@ -117,6 +127,11 @@ def _transform(place: PoseStamped, camera: str) -> TFMessage:
             )
         ]
     )
+
+
+def type_name(kind: type) -> str:
+    """`package/msg/Name` of a message class."""
+    return f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
 
 
 def product_from_msg(message: msg.PipeArray) -> Product:
@@ -155,8 +170,3 @@ def _run(message: msg.PipeRun) -> PipeRun:
         Joint(joint.kind, (*joint.pipes,), joint.angle, joint.length, joint.miss) for joint in message.joints
     )
     return PipeRun(message.id, tuple(message.pipes), joints, message.barrel_length, message.centre_line_length)
-
-
-def _type_name(kind: type) -> str:
-    """`package/msg/Name` of a message class."""
-    return f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"

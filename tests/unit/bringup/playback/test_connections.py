@@ -11,7 +11,7 @@ import rclpy
 from rclpy.node import Node
 from std_msgs.msg import Empty
 
-from pipeprog_bringup.playback.connections import PUBLISHERS, SUBSCRIBERS, missing_connections
+from pipeprog_bringup.playback.connections import LISTENER, PUBLISHERS, SUBSCRIBERS, missing_connections
 
 TIMEOUT = 20.0  # s, for the discovery of a node in the same process, which takes milliseconds on an idle machine
 IMAGES, MOTION = ["image/compressed", "camera_info"], ["odometry"]
@@ -27,7 +27,9 @@ class Graph:
 
     def add(self, name: str, topics: list[str] | None = None) -> None:
         node = self.nodes[name] = Node(name)
-        own = [topic for topic, names in SUBSCRIBERS.items() if name in names]
+        own = [
+            topic for topic, names in SUBSCRIBERS.items() if name in names or (name == "replay" and LISTENER in names)
+        ]
         own += {"frames": IMAGES, "sfm": MOTION}.get(name, [])
         for topic in own if topics is None else topics:
             node.create_subscription(Empty, topic, lambda _: None, 1)

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One goal of the action: it is filmed, worked off and written, and the client is told where it stands."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage
+
+from pipeprog_bringup.playback.listener import LastMessages
+from pipeprog_bringup.results import result_files
+from pipeprog_bringup.survey.goal import Goal
+from pipeprog_bringup.survey.passage import Cancelled, Passage, SurveyFailure
+from pipeprog_bringup.survey.survey_output import SurveyOutput
+from pipeprog_camera.errors import InputError
+from pipeprog_msgs.action import Survey
+from pipeprog_node import messages, qos
+from pipeprog_node.keyframe_input import CALIBRATIONS, DEPTH, IMAGES
+
+FEEDBACK_PERIOD = 0.5  # s
+ROOM_PERIOD = 1.0  # s between two looks at the disk
+# Shares of the work after filming that are done when a stage begins; measured on a lab: reconstruction 60 %.
+_SHARE_BEFORE = {Survey.Feedback.RECONSTRUCTING: 0.0, Survey.Feedback.MEASURING: 0.6, Survey.Feedback.WRITING: 0.9}
+
+
+class ConductedSurvey:
+    """Runs a goal to its result."""
+
+    def __init__(
+        self,
+        node: Node,
+        handle: ServerGoalHandle,
+        goal: Goal,
+        output: SurveyOutput,
+        tick: Callable[[], Awaitable[None]],
+        is_end_asked: Callable[[], bool],
+    ) -> None:
+        """`node` is this survey's alone; `tick` waits for a moment; `is_end_asked`: filming is to end."""
+        self._handle, self._goal, self._output = handle, goal, output
+        self._wait, self._is_end_asked = tick, is_end_asked
+        self._started = self._told = self._looked = time.monotonic()
+        self._stopped = False  # a cancel is heard until it is obeyed
+        self._is_full = False
+        self._passage = Passage(node, self._tick, lambda: handle.is_cancel_requested and not self._stopped)
+        depth = qos.reliable(DEPTH)
+        node.create_subscription(CompressedImage, IMAGES, self._keep_image, depth, raw=True)
+        node.create_subscription(CameraInfo, CALIBRATIONS, self._keep_calibration, depth)
+
+    async def run(self) -> Survey.Result:
+        """The result, with the folder written; that of a cancelled goal has what there was."""
+        result = Survey.Result()
+        passage, settings = self._passage, {}
+        survey: LastMessages | None = None
+        try:
+            await passage.begin(self._goal, self._output.colmap)
+            settings = await passage.settings()
+            filming = time.monotonic()
+            limit = self._goal.time_limit or math.inf
+            await passage.film(lambda: self._is_end_asked() or self._is_full or time.monotonic() - filming > limit)
+            survey = await passage.work_off()
+        except SurveyFailure as failure:
+            result.error_code, result.error_msg = failure.code, str(failure)
+        except Cancelled:
+            result.error_msg = ""
+        self._stopped = True
+        await self._written(result, survey or passage.maps.newest, settings)
+        await self._at_rest()
+        return result
+
+    async def _written(self, result: Survey.Result, survey: LastMessages | None, settings: dict[str, Any]) -> None:
+        """Writes what there is and notes it in the result; without a frame there is nothing."""
+        passage, output = self._passage, self._output
+        passage.stage = Survey.Feedback.WRITING
+        result.sfm = passage.listener.status
+        if self._is_full and not result.error_code:
+            result.error_code = Survey.Result.NO_SPACE
+            result.error_msg = f"filming ended early: the disk of {output.path} is nearly full"
+        if not passage.log.considered:
+            output.discard()
+            return
+        write = partial(output.write, survey, passage.listener.status, passage.log, self._about(settings))
+        with ThreadPoolExecutor(1) as writer:
+            written = writer.submit(write)
+            while not written.done():
+                await self._tick()
+        try:
+            written.result()
+        except InputError as error:
+            result.error_code, result.error_msg = Survey.Result.NO_SPACE, str(error)
+            return
+        result.folder = str(output.path.resolve())
+        if survey is not None:
+            result.pipes = survey.pipes
+
+    async def _at_rest(self) -> None:
+        """The nodes wait for the next survey; one that does not answer now is asked again when that begins."""
+        try:
+            await self._passage.rest()
+        except SurveyFailure:
+            return
+
+    async def _tick(self) -> None:
+        now = time.monotonic()
+        if now - self._told >= FEEDBACK_PERIOD:
+            self._told = now
+            self._handle.publish_feedback(self._feedback(now - self._started))
+        if now - self._looked >= ROOM_PERIOD:
+            self._looked = now
+            self._is_full = self._is_full or not self._output.has_room
+        await self._wait()
+
+    def _keep_image(self, data: bytes) -> None:
+        if not self._stopped:
+            self._output.keep_image(deserialize_message(data, CompressedImage), data)
+
+    def _keep_calibration(self, info: CameraInfo) -> None:
+        if not self._stopped:
+            self._output.keep_calibration(info)
+
+    def _feedback(self, elapsed: float) -> Survey.Feedback:
+        passage = self._passage
+        log, status, maps = passage.log, passage.listener.status, passage.maps
+        return Survey.Feedback(
+            state=passage.stage,
+            frames=log.considered,
+            keyframes=log.chosen,
+            registered=status.keyframes_registered,
+            waiting=status.keyframes_waiting,
+            tracking=log.is_tracking,
+            last_known=maps.poses.poses[-1] if maps.poses is not None and maps.poses.poses else PoseStamped(),
+            metric=status.metric,
+            advice=status.message,
+            classes=[] if maps.newest is None else maps.newest.pipes.classes,
+            progress=self._progress(),
+            elapsed=messages.duration_msg(elapsed),
+        )
+
+    def _progress(self) -> float:
+        passage = self._passage
+        if passage.stage not in _SHARE_BEFORE:
+            return math.nan
+        share = _SHARE_BEFORE[passage.stage]
+        if passage.stage == Survey.Feedback.RECONSTRUCTING and passage.log.chosen:
+            share += 0.5 * _SHARE_BEFORE[Survey.Feedback.MEASURING] * passage.listener.answered / passage.log.chosen
+        return min(share, 1.0)
+
+    def _about(self, settings: dict[str, Any]) -> dict[str, dict[str, Any]]:
+        """What config.yaml and run.json say of this survey, besides versions and files."""
+        passage, site = self._passage, self._goal.site
+        status = passage.listener.status
+        config = settings | {
+            "boq": result_files.boq_entries(site.boq),
+            "boards": [board.name for board in site.board_file.boards],
+        }
+        facts = {
+            "command": "survey",
+            "frames_considered": passage.log.considered,
+            "keyframes": passage.log.chosen,
+            "registered": status.keyframes_registered,
+            "cancelled": bool(self._handle.is_cancel_requested),
+            "notes": [text for text in (status.calibration, status.message) if text],
+            "losses": passage.log.faults(),
+            "seeds": {name: values["seed"] for name, values in settings.items() if "seed" in values},
+            "timings_s": {"survey": time.monotonic() - self._started},
+        }
+        return {"config": config, "run": facts}

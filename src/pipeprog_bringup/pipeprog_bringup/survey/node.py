@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The managed node `survey`: one action that films, lets the graph finish, and writes the results folder."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from pipeprog_bringup.survey.conducted_survey import ConductedSurvey
+from pipeprog_bringup.survey.goal import check_goal, read_site
+from pipeprog_bringup.survey.robot_input import RobotInput
+from pipeprog_bringup.survey.survey_output import SurveyOutput
+from pipeprog_camera.errors import InputError
+from pipeprog_camera.outside_text import for_terminal
+from pipeprog_msgs.action import Survey
+from pipeprog_node import messages
+from pipeprog_node.main import run
+from pipeprog_node.parameters import declare_fixed
+
+TICK = 0.1  # s between two looks at what a survey waits for
+RESULT_TIMEOUT = 6 * 3600  # s that a result is kept for: a robot asks for it when it is home
+
+
+class SurveyNode(LifecycleNode):
+    """Conducts one survey after another; nothing of one is kept for the next."""
+
+    def __init__(self) -> None:
+        super().__init__("survey")
+        self._boq = declare_fixed(self, "boq", "", "file of the bill of quantities, where a goal names none")
+        self._board = declare_fixed(self, "board", "", "file of the boards, where a goal names none")
+        self._results = Path(declare_fixed(self, "results", "surveys", "folder that each survey gets a folder in"))
+        self._record = declare_fixed(self, "record", False, "keep the images of each survey as recording.mcap")
+        self._running: ServerGoalHandle | None = None
+        self._is_active = self._end_asked = False
+        self._waiting: list[Future] = []
+        group = ReentrantCallbackGroup()  # while a survey waits, the other callbacks must run
+        self._action = ActionServer(
+            self,
+            Survey,
+            "survey",
+            self._execute,
+            callback_group=group,
+            goal_callback=self._on_goal,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            result_timeout=RESULT_TIMEOUT,
+        )
+        self._end = self.create_service(Trigger, "~/end", self._on_end, callback_group=group)
+        # Steady time: a paused recording stops ROS time.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(TICK, self._wake, callback_group=group, clock=steady)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Reads the files that the parameters name, so that a mistake is known before the robot walks."""
+        try:
+            if self._boq:
+                read_site(self._boq, self._board)
+        except InputError as error:
+            self.get_logger().error(for_terminal(str(error)))
+            return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Goals are accepted."""
+        self._is_active = True
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """No goal is accepted any more; the survey that is filmed goes on to its result."""
+        self._is_active = False
+        self._end_asked = True
+        return super().on_deactivate(state)
+
+    def _on_goal(self, request: Survey.Goal) -> GoalResponse:
+        if not self._is_active or self._running is not None:
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    def _on_end(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._running is not None
+        response.message = "filming ends" if response.success else "no survey is running"
+        self._end_asked = response.success
+        return response
+
+    async def _execute(self, handle: ServerGoalHandle) -> Survey.Result:
+        if self._running is not None:  # two goals came before one was executed
+            handle.abort()
+            return Survey.Result(error_code=Survey.Result.GOAL_REJECTED, error_msg="another survey is running")
+        self._running, self._end_asked = handle, False
+        started = time.monotonic()
+        try:
+            result = await self._conducted(handle)
+        finally:
+            self._running = None
+        result.total_elapsed_time = messages.duration_msg(time.monotonic() - started)
+        if result.error_msg:
+            self.get_logger().error(for_terminal(result.error_msg))
+        if handle.is_cancel_requested:
+            handle.canceled()
+        elif result.pipes.map_revision and result.error_code in (Survey.Result.NONE, Survey.Result.NO_SPACE):
+            handle.succeed()
+        else:
+            handle.abort()
+        return result
+
+    async def _conducted(self, handle: ServerGoalHandle) -> Survey.Result:
+        request: Survey.Goal = handle.request
+        try:
+            site = read_site(request.boq or self._boq, request.board or self._board)
+            limit = messages.seconds(request.time_limit)
+            goal = check_goal(request.survey_id, site, request.reference, limit, self.get_clock().now().nanoseconds)
+            output = SurveyOutput(self._results, goal, self._record)
+        except InputError as error:
+            return Survey.Result(error_code=Survey.Result.BAD_INPUT, error_msg=str(error))
+        # A node of this survey alone: with it goes all that was subscribed.
+        listener = Node("survey_listener", namespace=self.get_namespace(), use_global_arguments=False)
+        self.executor.add_node(listener)
+        robot = RobotInput(self, output) if self._record else None
+        try:
+            return await ConductedSurvey(listener, handle, goal, output, self._tick, lambda: self._end_asked).run()
+        finally:
+            if robot is not None:
+                robot.close()
+            self.executor.remove_node(listener)
+            listener.destroy_node()
+
+    async def _tick(self) -> None:
+        future = Future()
+        self._waiting.append(future)
+        await future
+
+    def _wake(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for future in waiting:
+            future.set_result(None)
+
+
+def main() -> None:
+    """Entry point of survey_node."""
+    run(SurveyNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The results folder of a survey that is filmed now: keyframes go into it as they come, the rest at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from pathlib import Path
+from typing import Any
+
+from sensor_msgs.msg import CameraInfo, CompressedImage
+
+from pipeprog_bringup.playback.frame_log import FrameLog
+from pipeprog_bringup.playback.listener import LastMessages
+from pipeprog_bringup.playback.survey_writer import (
+    coverage_of,
+    record_cameras,
+    record_survey,
+    type_name,
+    write_survey,
+)
+from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.results import result_files
+from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.plan_file import write_plan
+from pipeprog_bringup.survey.goal import Goal
+from pipeprog_camera.errors import InputError
+from pipeprog_msgs import msg
+from pipeprog_node import messages
+
+MIN_FREE = 1 << 30  # bytes; 1 GiB: the results of a field of 58 pipes take 0.4 GB, cloud and keyframes included
+
+
+class SurveyOutput:
+    """Writes one survey; nothing of it has its name before `write`, and nothing is left where that does not come.
+
+    Attributes:
+        path: the folder.
+    """
+
+    def __init__(self, results: Path, goal: Goal, record: bool) -> None:
+        """Raises InputError where the folder has another survey's files, or no room."""
+        self.path = results / goal.name
+        self._goal = goal
+        self._open = contextlib.ExitStack()
+        self._folder = self._open.enter_context(OutputFolder(self.path))
+        if not self.has_room:
+            self.discard()
+            raise InputError(
+                f"less than {MIN_FREE >> 30} GiB is free for {self.path}: make room, or change the parameter results"
+            )
+        self._recording = self._bag("out.mcap")
+        version = result_files.package_version("pipeprog") or "unknown"
+        self._recording.describe({"site": goal.site.boq_path.stem, "survey": goal.name, "pipeprog": version})
+        self._input = self._bag("recording.mcap") if record else None
+        self._infos: dict[int, CameraInfo] = {}  # of the keyframes, by stamp
+
+    @property
+    def colmap(self) -> Path:
+        """Where the sparse model goes."""
+        return self._folder.file("colmap")
+
+    def keep_image(self, image: CompressedImage, data: bytes) -> None:
+        """Writes the image of a keyframe into out.mcap; `data`: the message as it came, in CDR."""
+        stamp = messages.stamp_ns(image.header.stamp)
+        self._recording.write("/keyframes/image/compressed", type_name(CompressedImage), data, stamp)
+
+    def keep_calibration(self, info: CameraInfo) -> None:
+        """Keeps the calibration of a keyframe for the end: the survey may refine it."""
+        self._infos[messages.stamp_ns(info.header.stamp)] = info
+
+    def keep_input(self, topic: str, kind: type, data: bytes, stamp: int) -> None:
+        """Writes a message of the robot into recording.mcap, if the input is recorded; `stamp` [ns]: when it came."""
+        if self._input is not None:
+            self._input.write(topic, type_name(kind), data, stamp)
+
+    def write(
+        self, survey: LastMessages | None, status: msg.SfmStatus, log: FrameLog, about: dict[str, dict[str, Any]]
+    ) -> None:
+        """Writes all that there is, and gives the files their names; without a `survey` there is no map.
+
+        `about`: what config.yaml and run.json are to say, under `config` and `run`.
+        """
+        if survey is not None:
+            record_survey(self._recording, survey, status)
+            cameras = record_cameras(self._recording, survey, self._infos)
+            coverage = coverage_of(survey, cameras, self._goal.site.boq.pipes)
+            write_survey(self._folder, survey, log, coverage, with_cloud=True)
+        else:
+            result_files.write_frames(self._folder.file("frames.csv"), log.rows())
+        if self._goal.site.boq.pipes:
+            write_plan(self._folder.file("plan.json"), self._goal.site.boq.pipes)
+        result_files.write_config(self._folder.file("config.yaml"), about["config"])
+        result_files.write_run(self._folder, about["run"])
+        self._open.close()
+
+    def discard(self) -> None:
+        """Ends without results."""
+        with contextlib.suppress(_DiscardedError), self._open:
+            raise _DiscardedError
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the disk has room for what a survey writes at its end."""
+        return shutil.disk_usage(self.path).free >= MIN_FREE
+
+    def _bag(self, name: str) -> BagWriter:
+        stream = self._open.enter_context(self._folder.file(name).open("wb"))
+        return self._open.enter_context(BagWriter(stream))
+
+
+class _DiscardedError(Exception):
+    """Ends a survey without results."""

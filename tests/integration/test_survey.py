@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Surveys by the action: one after another in one graph over real DDS, to the end, cancelled, and refused."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+import yaml
+from action_msgs.msg import GoalStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage
+from std_srvs.srv import Trigger
+
+from pipeprog_bringup.recording.bag import Bag
+from pipeprog_msgs.action import Survey
+from pipeprog_msgs.msg import FrameDecision
+from pipeprog_node import messages, qos
+
+BAGS = Path(__file__).parents[2] / "bags"
+BAG, BOQ, BOARD = (BAGS / f"demo.{end}" for end in ("mcap", "boq.yaml", "board.yaml"))
+BOARD_SEEN = slice(3, 19)  # frames from the first that shows the whole board
+COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # the graph is tested here, not its accuracy
+TIMEOUT = 240.0  # s, for whatever takes seconds on an idle machine
+PERIOD = 0.1  # s between two images
+MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"} | {
+    "survey": "pipeprog_bringup.survey.node"
+}
+REPLAYED = {"cloud.las", "cloud.ply", "config.yaml", "frames.csv", "out.mcap", "pipes.json", "progress.csv", "run.json"}
+REPLAYED |= {"trajectory.tum", "colmap/cameras.txt", "colmap/images.txt", "colmap/points3D.txt"}
+
+
+class Mission:
+    """A robot whose camera never rests, and the client of its surveys."""
+
+    def __init__(self) -> None:
+        self.node = Node("mission")
+        self.feedback: list[Survey.Feedback] = []
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._images = self.node.create_publisher(CompressedImage, "image/compressed", qos.reliable(10))
+        self._infos = self.node.create_publisher(CameraInfo, "camera_info", qos.reliable(10))
+        self._frames = list(Bag.open(BAG))[BOARD_SEEN]
+        self._stamps = itertools.count(1_700_000_000_000_000_000, 200_000_000)
+        self._place = 0  # number of the frame that the camera shows
+        self._shown = self._decided = 0  # stamps of the first image of that frame, and of the last decision
+        self.node.create_subscription(FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
+        self.node.create_timer(PERIOD, self._film)
+        self.client = ActionClient(self.node, Survey, "survey")
+        self.state = self.node.create_client(ChangeState, "survey/change_state")
+        self.end = self.node.create_client(Trigger, "survey/end")
+
+    def wait_for(self, condition: Callable[[], object], seconds: float = TIMEOUT) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, "waited in vain"
+            self._executor.spin_once(timeout_sec=PERIOD)
+
+    def call(self, client: Any, request: Any) -> Any:
+        self.wait_for(client.service_is_ready)
+        future = client.call_async(request)
+        self.wait_for(future.done)
+        return future.result()
+
+    def change(self, transition: int) -> bool:
+        return bool(self.call(self.state, ChangeState.Request(transition=Transition(id=transition))).success)
+
+    def send(self, **goal: str) -> Any:
+        """The handle of a goal; the robot stands at the beginning of its walk."""
+        self.feedback.clear()
+        self._place = 0
+        self.wait_for(self.client.server_is_ready)
+        future = self.client.send_goal_async(Survey.Goal(**goal), lambda heard: self.feedback.append(heard.feedback))
+        self.wait_for(future.done)
+        return future.result()
+
+    def result(self, handle: Any) -> Any:
+        future = handle.get_result_async()
+        self.wait_for(future.done)
+        return future.result()
+
+    def _film(self) -> None:
+        """An image of the walk, which goes on once one of its place was decided on: live images get lost."""
+        stamp = next(self._stamps)
+        if self._decided >= self._shown:
+            self._place = min(self._place + 1, len(self._frames) - 1)
+            self._shown = stamp
+        frame = self._frames[self._place]
+        info = deserialize_message(frame.camera_info, CameraInfo)
+        image = deserialize_message(frame.data, CompressedImage)
+        info.header = image.header = messages.header(stamp, frame.frame_id)
+        self._infos.publish(info)
+        self._images.publish(image)
+
+    def _on_decision(self, message: FrameDecision) -> None:
+        self._decided = max(self._decided, messages.stamp_ns(message.header.stamp))
+
+
+@pytest.fixture
+def mission() -> Iterator[Mission]:
+    rclpy.init()
+    mission = Mission()
+    yield mission
+    mission.client.destroy()
+    mission.node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.fixture
+def surveys(tmp_path: Path) -> Iterator[Path]:
+    """The folder of the surveys of a graph that runs."""
+    parameters: dict[str, dict[str, Any]] = {
+        "frames": {"idle": True},
+        "sfm": {"map_interval": 4, **COARSE},
+        "detect": {"boq": str(BOQ)},
+        "survey": {"boq": str(BOQ), "board": str(BOARD), "results": str(tmp_path / "surveys")},
+    }
+    started = []
+    for name, module in MODULES.items():
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(yaml.safe_dump({name: {"ros__parameters": parameters[name]}}))
+        command = [sys.executable, "-m", module, "--ros-args", "-r", f"__node:={name}", "--params-file", str(file)]
+        started.append(subprocess.Popen(command))
+    yield tmp_path / "surveys"
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def names(folder: Path) -> set[str]:
+    return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
+
+
+def test_surveys_come_one_after_another(mission: Mission, surveys: Path) -> None:
+    mission.wait_for(mission.client.server_is_ready)
+    assert not mission.send().accepted  # not configured yet
+    assert mission.change(Transition.TRANSITION_CONFIGURE)
+    assert mission.change(Transition.TRANSITION_ACTIVATE)
+
+    outside = mission.result(mission.send(survey_id="../outside"))
+    assert outside.status == GoalStatus.STATUS_ABORTED
+    assert outside.result.error_code == Survey.Result.BAD_INPUT
+    assert "survey_id" in outside.result.error_msg
+    assert not surveys.exists()
+
+    handle = mission.send(survey_id="first")
+    assert handle.accepted
+    assert not mission.send().accepted  # one at a time
+    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].metric)
+    assert mission.call(mission.end, Trigger.Request()).success
+    first = mission.result(handle)
+    assert (first.status, first.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")
+    assert first.result.folder == str(surveys / "first")
+    assert names(surveys / "first") >= REPLAYED
+    written = json.loads((surveys / "first" / "pipes.json").read_text())
+    assert [pipe["id"] for pipe in written["pipes"]] == [pipe.id for pipe in first.result.pipes.pipes] != []
+
+    handle = mission.send(survey_id="second")
+    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].keyframes > 2)
+    assert mission.feedback[-1].frames < first.result.sfm.keyframes_seen + 20  # counted anew
+    asked = time.monotonic()
+    mission.wait_for(handle.cancel_goal_async().done)
+    second = mission.result(handle)
+    assert time.monotonic() - asked < 10.0
+    assert second.status == GoalStatus.STATUS_CANCELED
+    assert names(surveys / "second") >= {"frames.csv", "out.mcap", "run.json", "config.yaml"}
+    assert json.loads((surveys / "second" / "run.json").read_text())["cancelled"]
