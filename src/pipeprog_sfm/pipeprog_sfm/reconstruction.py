@@ -156,7 +156,8 @@ class Reconstruction:
     def update_dense(self) -> None:
         """Starts the depth maps that can be made by now; they are worked off in a thread of their own."""
         poses = self._map.camera_from_model()
-        self._dense.update(poses, self._images, self._map.points_seen, complete=False)
+        motions = self._map.motions(self._map.published)
+        self._dense.update(poses, self._images, self._map.points_seen, complete=False, motions=motions)
 
     def move(self, motion: RobotMotion) -> None:
         """Takes what odometry, TF and IMU have told since the last call."""
@@ -247,7 +248,8 @@ class Reconstruction:
 
     def _request(self, settled: bool, anew: bool) -> None:
         if settled:
-            self._dense.update(self._map.camera_from_model(), self._images, self._map.points_seen, complete=True)
+            poses, motions = self._map.camera_from_model(), self._map.motions(self._map.published)
+            self._dense.update(poses, self._images, self._map.points_seen, complete=True, motions=motions)
         scale, trajectory = self._metric()
         camera_from_map = dict(zip(trajectory.stamps.tolist(), np.linalg.inv(trajectory.map_from_camera), strict=True))
         cloud = self._dense.fuse(camera_from_map, self._map.camera_from_model(), scale.scale, settled, anew)

@@ -59,7 +59,7 @@ class OverlapTracker:
 
 def _report(keyframe: Keyframe, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> OverlapReport:
     """Overlap of a keyframe by the points of its features and of its neighbours'; None: not registered."""
-    keypoints = keyframe.features.keypoints
+    keypoints = keyframe.measured  # the hull of all features is that of the image as it is
     inside = keypoints[:0] if own is None else keypoints[own >= 0]
     size = keyframe.camera.width, keyframe.camera.height
     return OverlapReport(

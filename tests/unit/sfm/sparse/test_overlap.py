@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scenes import CAMERA, STEP
 
-from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_camera.rolling_shutter import RowMotion
+from pipeprog_sfm.features.keyframe import Keyframe, hull_area
 from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.sparse.overlap import OverlapTracker
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -36,6 +37,17 @@ def test_overlap_is_the_share_of_the_hull_and_of_the_cells_that_tie_points_span(
     assert told[0].matches_next == told[STEP].matches_previous == 3
     assert not told[2 * STEP].registered
     assert (told[2 * STEP].overlap, told[STEP].matches_next) == (0.0, 0)
+
+
+def test_features_shifted_to_the_middle_row_span_no_more_than_the_image_as_it_is() -> None:
+    moving = RowMotion(0.03, CAMERA.height, np.array([0.0, -2.0, 0.0]), np.zeros(3))
+    wider = keyframe(0, SQUARE).unrolled(moving, np.ones(4))
+    assert hull_area(wider.features.keypoints) > 1.02 * wider.hull
+    model = SparseModel()
+    model.add_view(0, wider.rays, wider.focal, np.eye(4))
+    model.points = np.zeros((4, 3))
+    model.point_of[:] = [0, 1, 2, 3]
+    assert [tie.overlap for tie in OverlapTracker().changed({0: wider}, model)] == [1.0]
 
 
 def test_it_is_told_again_when_it_changes_and_when_it_was_forgotten() -> None:
