@@ -29,7 +29,8 @@ ADVICE = {
         "wide to be seen at all.",
     ),
     "speed [m/s], phone with 4 ms and 15 ms": (
-        "Walk at 0.2 m/s with a phone; with a global shutter and short exposure 0.75 m/s will do.",
+        "Walk at 0.2 m/s with a phone whose read-out time is not known; with a global shutter, or a read-out that is "
+        "told, and short exposure 0.75 m/s will do.",
         "The phone of this table exposes for 4 ms and reads a frame out in 15 ms.\n"
         "Blur grows with speed times exposure, skew with speed times read-out time, and a fast walk has fewer views of "
         "each pipe.",
@@ -67,10 +68,12 @@ ADVICE = {
         "wide.",
     ),
     "rolling shutter [ms]": (
-        "Prefer a camera with a global shutter; with a rolling one, as phones have, walk at 0.2 m/s.",
-        "Rows of an image that are read at different times have different poses; the map takes them for one.\n"
+        "Prefer a camera with a global shutter; of a rolling one, as phones have, tell the read-out time "
+        "(`--set sfm.readout=0.015`, or `readout` in the camera's file), or walk at 0.2 m/s.",
+        "Rows of an image that are read at different times have different poses; without the read-out, the map takes "
+        "them for one.\n"
         "A board that is skewed by this contradicts its file, and a scale that may be wrong is refused.\n"
-        "This table is of 0.75 m/s; slower walks are under speed.",
+        "This table is of 0.75 m/s and read-outs that are not told; slower walks are under speed.",
     ),
 }
 COLUMNS = ("right class", "false", "F", "radius RMSE [mm]", "length error [%]", "scale error [%]")

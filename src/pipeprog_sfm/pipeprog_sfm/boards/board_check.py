@@ -78,5 +78,5 @@ def contradiction(place: PlacedBoard, residuals: CircleResiduals, tolerance: flo
     return (
         f"board {place.board.name} contradicts its file (circles off by {listed}; they should be right to "
         f"{1000 * tolerance:g} mm): measure its centres again, check that it is flat and the file is its own, "
-        "or walk slower past it if the camera has a rolling shutter"
+        "or tell the read-out time of a rolling shutter (sfm.readout, in seconds)"
     )
