@@ -20,7 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import Odometry, Path
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
@@ -123,6 +123,8 @@ def good_messages(number: int) -> dict[str, Any]:
         "/tf_static": TFMessage(transforms=[edge]),
         "map_points": messages.point_cloud(map_header, points, np.zeros((500, 3), np.uint8), normals),
         "keyframe_poses": messages.path(map_header, stamp + np.arange(3) * STEP, poses),
+        "keyframe_velocities": messages.keyframe_velocities(map_header, 0.015, np.ones((3, 3)), np.zeros((3, 3))),
+        "keyframes/refined_camera_info": info,
         "sfm_status": msg.SfmStatus(header=map_header, map_revision=number + 1, map_stamp=header.stamp, metric=True),
     }
 
@@ -383,6 +385,11 @@ def _many_retired(message: msg.KeyframesRetired, rng: random.Random) -> None:
     message.keyframes_published = rng.choice((0, 2**31, 2**32 - 1))
 
 
+def _many_velocities(message: msg.KeyframeVelocities, rng: random.Random) -> None:
+    message.velocities = (message.velocities or [Twist()])[:1] * rng.choice(MANY)
+    message.readout = rng.choice((0.0, -1.0, 1e9, math.nan, math.inf))
+
+
 _BOMBS: dict[type, tuple[Callable[[Any, random.Random], None], ...]] = {
     CompressedImage: (_image_bomb,),
     Image: (_raw_image_bomb,),
@@ -393,4 +400,5 @@ _BOMBS: dict[type, tuple[Callable[[Any, random.Random], None], ...]] = {
     TFMessage: (_transform_bomb,),
     msg.ImageOverlapArray: (_many_reports,),
     msg.KeyframesRetired: (_many_retired,),
+    msg.KeyframeVelocities: (_many_velocities,),
 }

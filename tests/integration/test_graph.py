@@ -151,7 +151,7 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
 
     result = json.loads((one / "pipes.json").read_text())
     assert faults_of_pipes(result) == []
-    assert result.keys() == {"frame_id", "scale", "pipes", "classes", "runs"}
+    assert result.keys() == {"frame_id", "scale", "walls_m2", "pipes", "classes", "runs"}
     assert result["frame_id"] == "map"
     assert result["scale"]["source"] == "board"
     assert 0 < result["scale"]["sigma"] < 0.01
@@ -159,7 +159,7 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
         assert pipe.keys() == {
             *("id", "start", "end", "radius", "radius_sigma", "length"),
             *("class", "class_probability", "class_kmeans", "ambiguous", "visible_arc_deg", "rmse", "points"),
-            *("length_sigma", "ends"),
+            *("length_sigma", "ends", "hidden_m", "not_seen_m"),
         }
         # Each coordinate and the length are rounded to the micrometre.
         assert pipe["length"] == pytest.approx(np.linalg.norm(np.subtract(pipe["end"], pipe["start"])), abs=3e-6)
@@ -276,7 +276,7 @@ def test_a_live_graph_maps_while_the_robot_walks(robot: Robot, nodes: dict[str, 
     robot.heard.clear()
     started, frames = time.monotonic(), iter(Bag.open(BAG))
     robot.walk(frames, 14, lambda: robot.maps and robot.markers)
-    robot.walk(frames, 14, lambda: len(robot.maps) > 1)
+    robot.walk(frames, 14, lambda: robot.maps[-1].width > robot.maps[0].width)
     elapsed = time.monotonic() - started
     heard = dict(robot.heard)
 

@@ -8,7 +8,7 @@ from typing import Any
 # Keys that a file of the kind has, and what it is; the first that fits.
 _KINDS = (
     ({"pipes", "scale", "classes"}, "it holds results, a pipes.json"),
-    ({"pipes"}, "it holds a site's ground truth"),
+    ({"pipes", "camera_to_world"}, "it holds a site's ground truth"),
     ({"classes"}, "it is a bill of quantities, which --boq takes"),
     ({"boards"}, "it is a board file, which --board takes"),
     ({"marks"}, "it is a board file, which --board takes"),

@@ -27,7 +27,12 @@ MISTAKES: list[tuple[str, Callable[[Path], Any], str | bytes, str]] = [
     ("bill as board", load_board_file, BOQ, "it is a bill of quantities, which --boq takes: are two files swapped"),
     ("bill as calibration", read_camera_file, BOQ, "it is a bill of quantities, which --boq takes"),
     ("picture as calibration", read_camera_file, b"\xff\xd8\xff\xe0" + bytes(99), "is a JPEG image, not a text file"),
-    ("truth as result", read_result, '{"pipes": []}', "holds a site's ground truth: give the results first"),
+    (
+        "truth as result",
+        read_result,
+        '{"pipes": [], "camera_to_world": []}',
+        "holds a site's ground truth: give the results first",
+    ),
     ("result as truth", read_truth, '{"scale": {}, "pipes": [], "classes": []}', "give the results first"),
     ("metres", load_boq, ENTRY % "outer_radius_mm: 0.1095", "metres"),
     ("decimal comma", load_boq, ENTRY % "outer_radius_mm: 57,5", "Write 57.5 for 57,5"),

@@ -120,7 +120,7 @@ def test_what_is_no_scan(tmp_path: Path) -> None:
     (tmp_path / "v.mp4").write_bytes(b"")
     with pytest.raises(InputError, match=r"no scan of Stray Scanner or Polycam"):
         run(tmp_path / "folder")
-    with pytest.raises(InputError, match=r"give --camera CAMERA\.yaml"):
+    with pytest.raises(InputError, match=r"v\.mp4 is no video that can be read"):
         run(tmp_path / "v.mp4")
 
 
