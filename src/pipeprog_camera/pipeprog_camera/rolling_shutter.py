@@ -2,7 +2,8 @@
 """A rolling shutter: where a camera that moves while its rows are read out shows a point.
 
 Geometry lives in the ideal pinhole image of the moment of the stamp, that of the middle row. A pixel of that image and
-the pixel that the camera measures are related by the depth of what is seen, by `RowMotion`.
+the pixel that the camera measures are related by the depth of what is seen, by `RowMotion`; `rolled_image` has the way
+back.
 """
 
 from __future__ import annotations
@@ -16,10 +17,6 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_READOUT
-
-# Each step multiplies the error by the pixels that the image moves while one row is read, at most 0.1 (70 px in 720
-# rows): 70 px become 0.001 px.
-_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -50,32 +47,8 @@ class RowMotion:
         """When rows (pixel centres at integers) are exposed, s after the stamp, which is that of the middle row."""
         return ((np.asarray(rows, float) + 0.5) / self.height - 0.5) * self.readout
 
-    def rolled_pixels(self, pixels: ArrayLike, points_in_camera: ArrayLike, camera: Camera) -> FloatArray:
-        """Where the rolling camera shows points.
-
-        Args:
-            pixels: (N, 2) of the ideal pinhole image of the stamp.
-            points_in_camera: (N, 3) what is seen there, in the camera's frame at the stamp, in the unit of `linear`.
-            camera: calibration; a row is one of the image as the lens draws it.
-
-        Returns:
-            (N, 2) pixels of the ideal pinhole image with rolling rows (`camera.distort_points` gives those of the
-            image).
-        """
-        base = np.asarray(pixels, float).reshape(-1, 2)
-        points = np.asarray(points_in_camera, float).reshape(-1, 3)
-        if self.readout == 0.0:
-            return base
-        start = _projected(points, camera)
-        rolled: FloatArray = base
-        for _ in range(_STEPS):
-            times = self.row_times(camera.distort_points(rolled)[:, 1])
-            moved = _turned(self.angular * times[:, None], points) + self.linear * times[:, None]
-            rolled = base + _projected(moved, camera) - start
-        return rolled
-
     def unrolled_pixels(self, pixels: ArrayLike, depths: ArrayLike, camera: Camera) -> FloatArray:
-        """Where a camera whose rows are all exposed at the stamp would show what is measured: `rolled_pixels` undone.
+        """Where an image whose rows are all exposed at the stamp shows what is measured; undoes `RolledImage.shown`.
 
         Args:
             pixels: (N, 2) measured, in the ideal pinhole image with rolling rows.

@@ -13,7 +13,7 @@ from pipeprog_sfm.config import CalibrationConfig
 from pipeprog_sfm.sparse.self_calibration import RADII, Refinement, numbers_of
 
 FIRST_CHECK = 6  # keyframes: fewer tie points seen from three sides do not tell k1 to a third of its prior
-CHECK_GROWTH = 2  # in keyframes, between two looks while keyframes come: their cost stays a constant share
+CHECK_GROWTH = 2  # ratio of the keyframes at two checks while keyframes come: their cost stays a constant share
 EARLY_SHIFT = 1.0  # px, of a point of the image: below, every match passes the geometric checks, and the end will do
 FINAL_SHIFT = 0.2  # px: a careful calibration with a board is right to this at the image's edge
 MAX_BOARD_GROWTH = 1.1  # of a board's misfit, with a better camera: of 20 circles it is known to a tenth
@@ -51,7 +51,7 @@ class CameraInUse:
         return self._told if self._told and self._accepted and used == self._accepted.camera else used
 
     def is_due(self, keyframes: int) -> bool:
-        """Whether to look at the calibration, after so many registered keyframes; each time once."""
+        """Whether to check the calibration at this number of registered keyframes; True once per check."""
         due = self.config.focal_sigma > 0 and keyframes >= self._next_check
         while keyframes >= self._next_check:
             self._next_check *= CHECK_GROWTH

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rolled and unrolled pixels: each undoes the other, and both agree with the generator's rolling sensor."""
+"""Pixels at the stamp and of a rolling shutter: each undoes the other, both are those of the rolling generator."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "bags"))
@@ -41,21 +42,20 @@ def test_unrolled_undoes_rolled(
 ) -> None:
     points, pixels = seen(seed, camera)
     motion = RowMotion(readout, camera.height, linear, angular)
-    rolled = motion.rolled_pixels(pixels, points, camera)
+    rolled = RolledImage(motion, camera).shown(pixels, points[:, 2])
     np.testing.assert_allclose(motion.unrolled_pixels(rolled, points[:, 2], camera), pixels, atol=0.01)
 
 
 def test_no_readout_gives_the_input() -> None:
     points, pixels = seen(1, LENS)
     motion = RowMotion(0.0, 720, np.ones(3), np.ones(3))
-    assert (motion.rolled_pixels(pixels, points, LENS) == pixels).all()
     assert (motion.unrolled_pixels(pixels, points[:, 2], LENS) == pixels).all()
 
 
 def test_a_pixel_moves_by_what_the_camera_moves_until_its_row() -> None:
     """At 1 m/s to the right, 2 m away, the last row of 20 ms (10 ms after the stamp) is 10 mm late: 4.57 px."""
     motion = RowMotion(0.02, 720, np.array([-1.0, 0.0, 0.0]), np.zeros(3))
-    rolled = motion.rolled_pixels([[639.5, 719.5]], [[0.0, 2.0 * 360 / 914, 2.0]], CAMERA)
+    rolled = RolledImage(motion, CAMERA).shown(np.array([[639.5, 719.5]]), np.array([2.0]))
     assert rolled[0] == pytest.approx([639.5 - 914 * 0.01 / 2, 719.5])
 
 
@@ -72,7 +72,7 @@ def test_it_is_the_generators_rolling_sensor() -> None:
     linear = rate[:3, 3] - np.cross(angular, now[:3, 3])
     inside, pixels = seen(4, CAMERA)
     motion = RowMotion(readout, 720, linear, angular)
-    rolled = motion.rolled_pixels(pixels, inside, CAMERA)
+    rolled = RolledImage(motion, CAMERA).shown(pixels, inside[:, 2])
     world = (inside - now[:3, 3]) @ now[:3, :3]
     rows = motion.row_times(rolled[:, 1])
     assert rows == pytest.approx(((rolled[:, 1] + 0.5) / 720 - 0.5) * readout)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import match
@@ -104,7 +105,7 @@ def view(
     seen &= rng.random(len(points)) < 0.7
     index = rng.permutation(np.flatnonzero(seen))
     if motion is not None:
-        pixels[index] = motion.rolled_pixels(pixels[index], inside[index], CAMERA)
+        pixels[index] = RolledImage(motion, CAMERA).shown(pixels[index], inside[index, 2])
     clutter = 100
     keypoints = pixels[index] + rng.normal(0, NOISE, (len(index), 2))
     keypoints = np.concatenate([keypoints, rng.uniform([0, 0], [1280, 720], (clutter, 2))])

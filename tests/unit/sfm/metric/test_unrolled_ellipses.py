@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from targets import BOARD, CAMERA, camera_from_board, exact_ellipses
 
+from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.ellipses import PROFILES, ImageEllipses, fit_ellipses, rim_points
@@ -20,7 +21,7 @@ def rolled(ellipses: ImageEllipses, pose: np.ndarray) -> ImageEllipses:
     rims = rim_points(ellipses.centres, ellipses.shapes)[0].reshape(-1, 2)
     rays = np.c_[(rims - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones(len(rims))]
     inside = rays * (pose[:3, 2] @ pose[:3, 3] / (rays @ pose[:3, 2]))[:, None]
-    shown = MOTION.rolled_pixels(rims, inside, CAMERA).reshape(-1, PROFILES, 2)
+    shown = RolledImage(MOTION, CAMERA).shown(rims, inside[:, 2]).reshape(-1, PROFILES, 2)
     centres, shapes, rms, _ = fit_ellipses(shown, np.ones(shown.shape[:2]))
     return ImageEllipses(centres, shapes, rms)
 
