@@ -34,7 +34,9 @@ from benchmarks.survey import RESULTS, RUNS, attempt, commit
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_bringup.results.result_files import read_trajectory
-from pipeprog_bringup.results.scoring import Result, Segment, align, read_truth, score
+from pipeprog_bringup.results.scored_files import Result, Segment, read_truth
+from pipeprog_bringup.results.scoring import score
+from pipeprog_bringup.results.truth_alignment import align
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.config import DetectConfig

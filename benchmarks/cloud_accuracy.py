@@ -21,7 +21,8 @@ from scipy.spatial import KDTree
 from benchmarks.recordings import Recording, named
 from benchmarks.survey import RESULTS, RUNS, survey
 from pipeprog_bringup.results.cloud_io import read_cloud
-from pipeprog_bringup.results.scoring import Truth, aligned, read_truth
+from pipeprog_bringup.results.scored_files import Truth, read_truth
+from pipeprog_bringup.results.truth_alignment import aligned
 from pipeprog_camera.arrays import FloatArray
 
 SAMPLE = 200_000  # points of the cloud that are measured

@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeprog_bringup.results.scoring import Segment, match, relations
+from pipeprog_bringup.results.scored_files import Segment
+from pipeprog_bringup.results.scoring import match, relations
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass

@@ -21,7 +21,7 @@ from benchmarks.motions import decoded, mapped
 from benchmarks.recordings import made, named
 from benchmarks.survey import RESULTS
 from pipeprog_bringup.recording.bag import Bag
-from pipeprog_bringup.results.scoring import read_truth
+from pipeprog_bringup.results.scored_files import read_truth
 from pipeprog_camera.similarity import similarity
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper

@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.front_ends import LAYOUTS, judged, measured, segment, taken
 from benchmarks.recordings import ROOT
 from benchmarks.survey import RESULTS, commit
-from pipeprog_bringup.results.scoring import Segment
+from pipeprog_bringup.results.scored_files import Segment
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.types import Cylinder
 

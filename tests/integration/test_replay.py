@@ -26,7 +26,7 @@ from tf2_msgs.msg import TFMessage
 
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag_writer import BagWriter
-from pipeprog_bringup.results.scoring import read_result
+from pipeprog_bringup.results.scored_files import read_result
 from pipeprog_camera.camera import Camera
 
 ROOT = Path(__file__).parents[2]

@@ -17,8 +17,10 @@ import typer
 
 from pipeprog_bringup.cli import app
 from pipeprog_bringup.results.result_files import FRAME_COLUMNS
-from pipeprog_bringup.results.scoring import Result, Segment, Truth, align, score
+from pipeprog_bringup.results.scored_files import Result, Segment, Truth
+from pipeprog_bringup.results.scoring import score
 from pipeprog_bringup.results.setting_overrides import effective
+from pipeprog_bringup.results.truth_alignment import align
 from pipeprog_camera.errors import InputError
 
 ROOT = Path(__file__).parents[2]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from pipeprog_bringup.console import print_progress, print_score
-from pipeprog_bringup.results.scoring import Result, Segment, Truth, score
+from pipeprog_bringup.results.scored_files import Result, Segment, Truth
+from pipeprog_bringup.results.scoring import score
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.product import Product
 

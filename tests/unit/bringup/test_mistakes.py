@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pipeprog_bringup.footage.camera_file import read_camera_file
-from pipeprog_bringup.results.scoring import read_result, read_truth
+from pipeprog_bringup.results.scored_files import read_result, read_truth
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_boq
 from pipeprog_sfm.boards.board import symmetries

@@ -9,22 +9,16 @@ scored apart.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from pipeprog_bringup.results.pipes_file import number, rows_of, vector
-from pipeprog_bringup.results.result_files import read_frame_stamps, read_trajectory
+from pipeprog_bringup.results.scored_files import Result, Segment, Truth, read_result, read_truth
+from pipeprog_bringup.results.truth_alignment import Alignment, aligned
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_camera.errors import InputError
-from pipeprog_camera.file_kinds import kind_of
-from pipeprog_camera.json_file import read_json
-from pipeprog_camera.limits import MAX_CLASSES, MAX_COORDINATE, MAX_SCORED
-from pipeprog_camera.outside_text import name_of, shown
-from pipeprog_camera.similarity import similarity
 
 # When a detection is a pipe of the truth: axes nearer than the larger of the radius and 20 mm, angle under 3 degrees,
 # the common stretch over half of either length.
@@ -37,54 +31,6 @@ IGNORE_ANGLE_MAX = np.radians(15.0)
 CLASS_TOLERANCE = 0.01
 # Of Gaussian errors 99.7 % lie within this many standard deviations.
 SIGMAS = 3.0
-# Stamps in trajectory.tum are seconds as decimals, which other tools round to milliseconds at worst.
-STAMP_TOLERANCE = 1_000_000  # ns
-
-
-@dataclass(frozen=True)
-class Segment:
-    """A cylinder of the truth or of the result: ends (3,) [m], radius [m], length [m], id, class or None.
-
-    `radius_sigma`, `length_sigma`: standard deviations [m], None where they are not known.
-    """
-
-    start: FloatArray
-    end: FloatArray
-    radius: float
-    length: float
-    id: str
-    class_name: str | None = None
-    radius_sigma: float | None = None
-    length_sigma: float | None = None
-
-
-@dataclass(frozen=True)
-class Result:
-    """The content of pipes.json: detections in `map`, and the classes' radii [m]."""
-
-    pipes: tuple[Segment, ...]
-    class_radii: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Truth:
-    """Ground truth in its own frame `world`: pipes, cylinders to ignore, poses (N, 4, 4) of each frame's camera."""
-
-    pipes: tuple[Segment, ...]
-    ignore: tuple[Segment, ...]
-    world_from_camera: FloatArray
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """How the cameras fit the truth after alignment: `scale_error` relative, residuals [m]."""
-
-    world_from_map: FloatArray
-    poses: int
-    scale_error: float
-    rms_rigid: float
-    rms_similarity: float
-    max_similarity: float
 
 
 def score_files(pipes_json: Path, truth_json: Path) -> dict[str, Any]:
@@ -99,11 +45,6 @@ def score_files(pipes_json: Path, truth_json: Path) -> dict[str, Any]:
     if trajectory_file.exists() and len(truth.world_from_camera):
         trajectory = aligned(trajectory_file, truth_json)
     return score(result, truth, trajectory)
-
-
-def aligned(trajectory_file: Path, truth_json: Path) -> Alignment:
-    """How a trajectory.tum, with the frames.csv beside it, lies on the truth's poses; raises InputError."""
-    return align(*_pairs(trajectory_file, truth_json, read_truth(truth_json)))
 
 
 def score(result: Result, truth: Truth, trajectory: Alignment | None = None) -> dict[str, Any]:
@@ -173,116 +114,6 @@ def relations(detection: Segment, pipes: Sequence[Segment]) -> tuple[FloatArray,
     middles = starts + axes * (low + high)[:, None] / 2
     distances = np.linalg.norm(np.cross(middles - detection.start, direction), axis=1)
     return angles, distances, np.maximum(high - low, 0.0)
-
-
-def align(map_from_camera: FloatArray, world_from_camera: FloatArray) -> Alignment:
-    """Lay a trajectory onto the truth, poses (N, 4, 4) each.
-
-    The rigid motion for the pipes is fitted to positions and directions together: on a straight walk the positions
-    alone leave the turn about the walk open. Scale and residuals are of the positions alone (Umeyama 1991).
-    """
-    positions, true_positions = map_from_camera[:, :3, 3], world_from_camera[:, :3, 3]
-    spread = float(np.sqrt(((true_positions - true_positions.mean(0)) ** 2).sum(1).mean()))
-    if len(positions) < 3 or spread < 1e-3:
-        raise InputError(f"{len(positions)} poses within {spread * 1e3:.1f} mm are too few to align with the truth")
-    tripod = np.array([[0, 0, 0, 1], [spread, 0, 0, 1], [0, spread, 0, 1], [0, 0, spread, 1]]).T
-    corners = np.swapaxes(map_from_camera @ tripod, 1, 2)[..., :3].reshape(-1, 3)
-    true_corners = np.swapaxes(world_from_camera @ tripod, 1, 2)[..., :3].reshape(-1, 3)
-    rigid_residuals = _residuals(positions, true_positions, similarity(positions, true_positions, scaled=False))
-    world_from_map = similarity(positions, true_positions)
-    residuals = _residuals(positions, true_positions, world_from_map)
-    return Alignment(
-        world_from_map=similarity(corners, true_corners, scaled=False),
-        poses=len(positions),
-        scale_error=1 / float(np.cbrt(np.linalg.det(world_from_map[:3, :3]))) - 1,
-        rms_rigid=_rms(rigid_residuals),
-        rms_similarity=_rms(residuals),
-        max_similarity=float(residuals.max()),
-    )
-
-
-def read_result(path: Path) -> Result:
-    """The pipes.json of a run; raises InputError where it is none."""
-    content = read_json(path)
-    if isinstance(content, dict) and "classes" not in content and (kind := kind_of(content)):
-        raise InputError(f"{path} is no pipes.json of pipeprog: {kind}: give the results first, then the truth")
-    try:
-        pipes = tuple(_segment(pipe, str(pipe.get("id")), f"pipe {n}") for n, pipe in _numbered(content, "pipes"))
-        rows = rows_of(content, "classes", MAX_CLASSES)
-        class_radii = {
-            str(row.get("class")): number(row, "outer_radius", f"class {n}") for n, row in enumerate(rows, 1)
-        }
-        for pipe in pipes:
-            if pipe.class_name is not None and pipe.class_name not in class_radii:
-                raise InputError(f"class {shown(pipe.class_name)} of a pipe is not among its classes")
-    except InputError as error:
-        raise InputError(f"{path} is no pipes.json of pipeprog ({error}): run `pipeprog replay` again") from None
-    return Result(pipes, class_radii)
-
-
-def read_truth(path: Path) -> Truth:
-    """A truth file; raises InputError where it is none."""
-    content = read_json(path)
-    if isinstance(content, dict) and "scale" in content and (kind := kind_of(content)):
-        raise InputError(f"{path} is no truth file: {kind}: give the results first, then the truth")
-    try:
-        pipes = tuple(
-            _segment(pipe, str(pipe.get("id", n - 1)), f"pipe {n}") for n, pipe in _numbered(content, "pipes")
-        )
-        ignored = _numbered({"ignore": [], **content}, "ignore")
-        ignore = tuple(_segment(pipe, "ignore", f"cylinder {n} to ignore") for n, pipe in ignored)
-        poses = _poses(content.get("camera_to_world", []))
-    except InputError as error:
-        raise InputError(f"{path} is no truth file ({error}): it needs pipes with start, end, radius") from None
-    return Truth(pipes, ignore, poses)
-
-
-def _numbered(content: dict[str, Any], key: str) -> Iterable[tuple[int, dict[str, Any]]]:
-    return enumerate(rows_of(content, key, MAX_SCORED), 1)
-
-
-def _poses(value: Any) -> FloatArray:
-    """(N, 4, 4) of nested lists."""
-    try:
-        poses = np.asarray(value, float).reshape(-1, 4, 4)
-    except (TypeError, ValueError):
-        raise InputError(f"camera_to_world is {shown(value)}, not a list of 4 x 4 matrices") from None
-    if not (np.abs(poses) <= MAX_COORDINATE).all():
-        raise InputError(f"camera_to_world holds more than {MAX_COORDINATE:g} m")
-    return poses
-
-
-def _pairs(trajectory_file: Path, truth_json: Path, truth: Truth) -> tuple[FloatArray, FloatArray]:
-    """Poses of the run and of the truth that belong together."""
-    stamps, map_from_camera = read_trajectory(trajectory_file)
-    frame_stamps = read_frame_stamps(trajectory_file.parent / "frames.csv")
-    if len(frame_stamps) > len(truth.world_from_camera):
-        raise InputError(
-            f"{truth_json} has {len(truth.world_from_camera)} poses but {trajectory_file.parent / 'frames.csv'} "
-            f"{len(frame_stamps)} frames: it is the truth of another recording"
-        )
-    unique, first = np.unique(frame_stamps, return_index=True)
-    if not len(stamps) or not len(unique):
-        raise InputError(f"{trajectory_file} holds no poses: nothing was reconstructed")
-    after = np.clip(np.searchsorted(unique, stamps), 1, max(len(unique) - 1, 1))
-    candidates = np.stack([np.minimum(after, len(unique) - 1), after - 1])
-    gaps = np.abs(unique[candidates] - stamps)
-    nearest = np.take_along_axis(candidates, gaps.argmin(0)[None], 0)[0]
-    near = gaps.min(0) <= STAMP_TOLERANCE
-    return map_from_camera[near], truth.world_from_camera[first[nearest[near]]]
-
-
-def _segment(entry: dict[str, Any], name: Any, where: str) -> Segment:
-    start, end = (np.array(vector(entry, key, where)) for key in ("start", "end"))
-    radius, distance = number(entry, "radius", where), float(np.linalg.norm(end - start))
-    if radius == 0.0 or distance == 0.0:
-        raise InputError(f"{where} has no length or radius")
-    class_name = entry.get("class")
-    if not isinstance(class_name, str | None):
-        raise InputError(f"class of {where} is {shown(class_name)}, not a name")
-    length = number({"length": distance, **entry}, "length", where)
-    sigmas = (None if entry.get(key) is None else number(entry, key, where) for key in ("radius_sigma", "length_sigma"))
-    return Segment(start, end, radius, length, name_of(name, f"id of {where}"), class_name, *sigmas)
 
 
 def _moved(pipe: Segment, world_from_map: FloatArray) -> Segment:
@@ -430,7 +261,3 @@ def _radii(errors: list[dict[str, Any]]) -> list[float]:
 
 def _rms(values: Sequence[float] | FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _residuals(points: FloatArray, true_points: FloatArray, transform: FloatArray) -> FloatArray:
-    return np.linalg.norm(points @ transform[:3, :3].T + transform[:3, 3] - true_points, axis=1)

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from pipeprog_bringup.results.result_files import FrameRow, write_frames, write_trajectory
-from pipeprog_bringup.results.scoring import Alignment, Result, Segment, Truth, align, read_result, score, score_files
+from pipeprog_bringup.results.scored_files import Result, Segment, Truth, read_result
+from pipeprog_bringup.results.scoring import score, score_files
+from pipeprog_bringup.results.truth_alignment import Alignment, align
 from pipeprog_camera.errors import InputError
 
 CLASSES = {"DN65": 0.0365, "DN100": 0.0575}
