@@ -15,12 +15,12 @@ from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.playback.player import Player, calibration
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.results.result_files import FrameRow
-from pipeprog_node import messages, received
+from pipeprog_node import messages, received_images
 
 _DOORS: dict[Any, Callable[[Any], Any]] = {
-    CompressedImage: received.compressed_image,
-    Image: received.raw_image,
-    CameraInfo: received.camera_info,
+    CompressedImage: received_images.compressed_image,
+    Image: received_images.raw_image,
+    CameraInfo: received_images.camera_info,
 }
 
 

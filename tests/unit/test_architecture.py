@@ -38,7 +38,7 @@ GLUE = {
         "keyframe_input",
         "messages",
         "main",
-        "received",
+        *{"received_header", "received_images", "received_keyframes", "received_maps", "received_motion"},
         "renewal",
         "worker",
     },

@@ -42,14 +42,15 @@ from pipeprog_detect.worker import (
     serve,
 )
 from pipeprog_msgs import msg
-from pipeprog_node import messages, qos, received
+from pipeprog_node import messages, qos, received_images, received_maps
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import IMAGES, REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
-from pipeprog_node.received import ReceivedCamera, ReceivedCloud, ReceivedPoses, ReceivedStatus, ReceivedVelocities
+from pipeprog_node.received_images import ReceivedCamera
+from pipeprog_node.received_maps import ReceivedCloud, ReceivedPoses, ReceivedStatus, ReceivedVelocities
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 
@@ -87,11 +88,13 @@ class MapInput:
         self._use = use
         self._parts: OrderedDict[int, dict[type, Any]] = OrderedDict()  # by stamp
         self.revision = 0
-        intake.subscribe(PointCloud2, POINTS, received.map_points, self._keep, qos.latched())
-        intake.subscribe(Path, POSES, received.keyframe_poses, self._keep, qos.latched())
-        intake.subscribe(CameraInfo, REFINED_CALIBRATION, received.camera_info, self._keep, qos.latched())
-        intake.subscribe(msg.KeyframeVelocities, VELOCITIES, received.keyframe_velocities, self._keep, qos.latched())
-        intake.subscribe(msg.SfmStatus, "sfm_status", received.sfm_status, self._on_status, qos.latched())
+        intake.subscribe(PointCloud2, POINTS, received_maps.map_points, self._keep, qos.latched())
+        intake.subscribe(Path, POSES, received_maps.keyframe_poses, self._keep, qos.latched())
+        intake.subscribe(CameraInfo, REFINED_CALIBRATION, received_images.camera_info, self._keep, qos.latched())
+        intake.subscribe(
+            msg.KeyframeVelocities, VELOCITIES, received_maps.keyframe_velocities, self._keep, qos.latched()
+        )
+        intake.subscribe(msg.SfmStatus, "sfm_status", received_maps.sfm_status, self._on_status, qos.latched())
 
     @property
     def newest(self) -> CompleteMap | None:

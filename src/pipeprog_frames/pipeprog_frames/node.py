@@ -25,7 +25,7 @@ from pipeprog_frames.incoming.frame_buffer import EncodedFrame
 from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.selection import Selected, Selection
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
-from pipeprog_node import messages, qos, received
+from pipeprog_node import messages, qos, received_images, received_keyframes
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.discovery import stages_subscribed
 from pipeprog_node.finish import FinishService
@@ -128,7 +128,7 @@ class FrameInput:
 
     def _calibration(self, message: CameraInfo) -> tuple[int, Camera | None]:
         try:
-            info = received.camera_info(message)
+            info = received_images.camera_info(message)
         except InputError as error:
             self.intake.reject("camera_info", error)
             return messages.stamp_ns(message.header.stamp), None
@@ -318,14 +318,14 @@ class FramesNode(Node):
 
 
 def _compressed(message: CompressedImage) -> Arrival:
-    image = received.compressed_image(message)
+    image = received_images.compressed_image(message)
     encoded = image.encoded
     load = partial(decode_reduced, encoded, image.width)
     return Arrival(image.stamp, image.frame_id, (image.width, image.height), len(encoded), lambda: encoded, load)
 
 
 def _raw(message: Image) -> Arrival:
-    image = received.raw_image(message)
+    image = received_images.raw_image(message)
     pixels = image.pixels
     size = pixels.shape[1], pixels.shape[0]
     encode, load = partial(messages.encode_jpeg, pixels), partial(reduce_image, pixels)
@@ -333,7 +333,7 @@ def _raw(message: Image) -> Arrival:
 
 
 def _answer(message: ImageOverlapArray) -> Answer:
-    answer = received.image_overlaps(message)
+    answer = received_keyframes.image_overlaps(message)
     reports = tuple(OverlapReport(**vars(image)) for image in answer.images)
     return Answer(answer.stamp, answer.keyframes, answer.retirements, reports)
 

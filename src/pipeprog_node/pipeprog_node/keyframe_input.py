@@ -10,9 +10,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.limits import MAX_CAMERAS, MAX_ENCODED_IMAGE, MAX_UNPAIRED
-from pipeprog_node import messages, qos, received
+from pipeprog_node import messages, qos, received_images
 from pipeprog_node.intake import Intake, InvalidMessageError
-from pipeprog_node.received import ReceivedCamera, ReceivedImage
+from pipeprog_node.received_images import ReceivedCamera, ReceivedImage
 
 IMAGES, CALIBRATIONS = "keyframes/image/compressed", "keyframes/camera_info"
 # The camera as the survey's images tell it, where it differs from the calibration: with the stamp of a map.
@@ -46,10 +46,10 @@ class KeyframeInput:
         self._keys: dict[int, _Key] = {}  # the reverse
         depth = qos.reliable(DEPTH)
         intake.subscribe(
-            CompressedImage, IMAGES, received.compressed_image, self._on_image, depth, dropped=self._on_dropped
+            CompressedImage, IMAGES, received_images.compressed_image, self._on_image, depth, dropped=self._on_dropped
         )
         intake.subscribe(
-            CameraInfo, CALIBRATIONS, received.camera_info, self._on_camera, depth, dropped=self._on_dropped
+            CameraInfo, CALIBRATIONS, received_images.camera_info, self._on_camera, depth, dropped=self._on_dropped
         )
 
     def forget(self, stamps: Iterable[int]) -> None:

@@ -26,19 +26,15 @@ from pipeprog_camera.limits import (
     MAX_WAITING_MOTION,
 )
 from pipeprog_msgs import msg
-from pipeprog_node import messages, qos, received
+from pipeprog_node import messages, qos, received_keyframes, received_motion
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
-from pipeprog_node.received import (
-    ReceivedAcceleration,
-    ReceivedRetirement,
-    ReceivedTransform,
-    ReceivedTransforms,
-)
+from pipeprog_node.received_keyframes import ReceivedRetirement
+from pipeprog_node.received_motion import ReceivedAcceleration, ReceivedTransform, ReceivedTransforms
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
@@ -86,15 +82,15 @@ class MotionInput:
 
         def odometry(message: Odometry) -> ReceivedTransform:
             self.considered += 1
-            return received.odometry(message)
+            return received_motion.odometry(message)
 
         def imu(message: Imu) -> ReceivedAcceleration:
             self.considered += 1
-            return received.imu(message)
+            return received_motion.imu(message)
 
         def transforms(message: TFMessage) -> ReceivedTransforms:
             self.considered += len(message.transforms)
-            return received.transforms(message)
+            return received_motion.transforms(message)
 
         intake.subscribe(Odometry, "odometry", odometry, self._on_odometry, source, qos.OVERRIDABLE)
         intake.subscribe(Imu, "imu", imu, self._on_imu, source, qos.OVERRIDABLE)
@@ -276,7 +272,7 @@ class SfmNode(Node):
         self._camera_frame = ""  # of the newest keyframe
         self._finish_sent = False
         depth = qos.reliable(MAX_BACKLOG)
-        self._intake.subscribe(msg.KeyframesRetired, RETIRED, received.retirement, self._on_retired, depth)
+        self._intake.subscribe(msg.KeyframesRetired, RETIRED, received_keyframes.retirement, self._on_retired, depth)
         self._finish = FinishService(self, lambda: self._seen, self._begin_finish)
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
         # Wall time: the status must follow while a paused recording stops ROS time.

@@ -21,7 +21,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2, PointField
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.limits import MAX_CLOUD_FIELDS, MAX_CLOUD_POINTS, MAX_COORDINATE, MAX_POSES
 from pipeprog_msgs.msg import KeyframeVelocities, SfmStatus
-from pipeprog_node import messages, received
+from pipeprog_node import messages, received_images, received_maps
 from pipeprog_node.intake import InvalidMessageError
 
 CAMERA = Camera(1280, 720, 900.0, 901.0, 639.5, 359.5)
@@ -72,40 +72,40 @@ def velocities(speed: float = 1.0, readout: float = 0.015) -> KeyframeVelocities
 
 
 ROWS: list[tuple[str, Callable[[Any], object], Any]] = [
-    ("calibration: K of zeros", received.camera_info, changed(info(), "k", np.zeros(9))),
-    ("calibration: K of NaN", received.camera_info, changed(info(), "k", np.full(9, np.nan))),
-    ("calibration: K of inf", received.camera_info, changed(info(), "k", np.full(9, np.inf))),
-    ("calibration: binning", received.camera_info, changed(info(), "binning_x", 2)),
-    ("calibration: no size", received.camera_info, changed(info(), "width", 0)),
-    ("calibration: D of NaN", received.camera_info, changed(info(), "d", [np.nan] * 5)),
-    ("calibration: three coefficients", received.camera_info, changed(info(), "d", [0.1, 0.2, 0.3])),
-    ("calibration: unknown model", received.camera_info, changed(info(), "distortion_model", "magic")),
-    ("empty cloud: all NaN", received.map_points, cloud(POINTS * np.nan)),
-    ("empty cloud: all infinite", received.map_points, cloud(POINTS * np.inf)),
-    ("empty cloud: no points", received.map_points, cloud(POINTS[:0], NORMALS[:0])),
-    ("empty cloud: all out of range", received.map_points, cloud(POINTS + np.float32(1e30))),
-    ("point cloud: a point of no bytes", received.map_points, changed(cloud(), "point_step", 0)),
-    ("point cloud: no fields", received.map_points, changed(cloud(), "fields", [])),
-    ("point cloud: unknown datatype", received.map_points, changed(cloud(), "fields.0.datatype", 99)),
-    ("point cloud: normal_x alone", received.map_points, changed(cloud(), "fields.4.name", "other")),
-    ("point cloud: short data", received.map_points, changed(cloud(), "data", cloud().data[:-1])),
-    ("point cloud: field outside of a point", received.map_points, changed(cloud(), "fields.2.offset", 2**32 - 1)),
-    ("point cloud: field of 2^32 values", received.map_points, changed(cloud(), "fields.2.count", 2**32 - 1)),
-    ("point cloud: field of two values", received.map_points, changed(cloud(), "fields.1.count", 2)),
-    ("point cloud: two fields of one name", received.map_points, changed(cloud(), "fields.1.name", "x")),
-    ("normals: of zero length", received.map_points, cloud(normals=0.0 * NORMALS)),
-    ("poses: quaternion of zeros", received.keyframe_poses, changed(poses(), "poses.1.pose.orientation.w", 0.0)),
-    ("poses: quaternion of NaN", received.keyframe_poses, changed(poses(), "poses.1.pose.orientation.w", np.nan)),
-    ("poses: position of NaN", received.keyframe_poses, changed(poses(), "poses.1.pose.position.y", np.nan)),
-    ("velocities: of NaN", received.keyframe_velocities, velocities(speed=np.nan)),
-    ("velocities: faster than any camera", received.keyframe_velocities, velocities(speed=1e9)),
-    ("read-out: of a second", received.keyframe_velocities, velocities(readout=1.0)),
-    ("read-out: below zero", received.keyframe_velocities, velocities(readout=-0.01)),
-    ("read-out: of no rolling shutter", received.keyframe_velocities, velocities(readout=0.0)),
-    ("read-out: of NaN", received.sfm_status, SfmStatus(readout=np.nan)),
-    ("image: empty", received.compressed_image, picture(b"")),
-    ("image: not to be decoded", received.compressed_image, picture(b"no image")),
-    ("image: over 2^30 pixels", received.compressed_image, picture(png_of(40_000, 40_000))),
+    ("calibration: K of zeros", received_images.camera_info, changed(info(), "k", np.zeros(9))),
+    ("calibration: K of NaN", received_images.camera_info, changed(info(), "k", np.full(9, np.nan))),
+    ("calibration: K of inf", received_images.camera_info, changed(info(), "k", np.full(9, np.inf))),
+    ("calibration: binning", received_images.camera_info, changed(info(), "binning_x", 2)),
+    ("calibration: no size", received_images.camera_info, changed(info(), "width", 0)),
+    ("calibration: D of NaN", received_images.camera_info, changed(info(), "d", [np.nan] * 5)),
+    ("calibration: three coefficients", received_images.camera_info, changed(info(), "d", [0.1, 0.2, 0.3])),
+    ("calibration: unknown model", received_images.camera_info, changed(info(), "distortion_model", "magic")),
+    ("empty cloud: all NaN", received_maps.map_points, cloud(POINTS * np.nan)),
+    ("empty cloud: all infinite", received_maps.map_points, cloud(POINTS * np.inf)),
+    ("empty cloud: no points", received_maps.map_points, cloud(POINTS[:0], NORMALS[:0])),
+    ("empty cloud: all out of range", received_maps.map_points, cloud(POINTS + np.float32(1e30))),
+    ("point cloud: a point of no bytes", received_maps.map_points, changed(cloud(), "point_step", 0)),
+    ("point cloud: no fields", received_maps.map_points, changed(cloud(), "fields", [])),
+    ("point cloud: unknown datatype", received_maps.map_points, changed(cloud(), "fields.0.datatype", 99)),
+    ("point cloud: normal_x alone", received_maps.map_points, changed(cloud(), "fields.4.name", "other")),
+    ("point cloud: short data", received_maps.map_points, changed(cloud(), "data", cloud().data[:-1])),
+    ("point cloud: field outside of a point", received_maps.map_points, changed(cloud(), "fields.2.offset", 2**32 - 1)),
+    ("point cloud: field of 2^32 values", received_maps.map_points, changed(cloud(), "fields.2.count", 2**32 - 1)),
+    ("point cloud: field of two values", received_maps.map_points, changed(cloud(), "fields.1.count", 2)),
+    ("point cloud: two fields of one name", received_maps.map_points, changed(cloud(), "fields.1.name", "x")),
+    ("normals: of zero length", received_maps.map_points, cloud(normals=0.0 * NORMALS)),
+    ("poses: quaternion of zeros", received_maps.keyframe_poses, changed(poses(), "poses.1.pose.orientation.w", 0.0)),
+    ("poses: quaternion of NaN", received_maps.keyframe_poses, changed(poses(), "poses.1.pose.orientation.w", np.nan)),
+    ("poses: position of NaN", received_maps.keyframe_poses, changed(poses(), "poses.1.pose.position.y", np.nan)),
+    ("velocities: of NaN", received_maps.keyframe_velocities, velocities(speed=np.nan)),
+    ("velocities: faster than any camera", received_maps.keyframe_velocities, velocities(speed=1e9)),
+    ("read-out: of a second", received_maps.keyframe_velocities, velocities(readout=1.0)),
+    ("read-out: below zero", received_maps.keyframe_velocities, velocities(readout=-0.01)),
+    ("read-out: of no rolling shutter", received_maps.keyframe_velocities, velocities(readout=0.0)),
+    ("read-out: of NaN", received_maps.sfm_status, SfmStatus(readout=np.nan)),
+    ("image: empty", received_images.compressed_image, picture(b"")),
+    ("image: not to be decoded", received_images.compressed_image, picture(b"no image")),
+    ("image: over 2^30 pixels", received_images.compressed_image, picture(png_of(40_000, 40_000))),
 ]
 
 
@@ -120,23 +120,23 @@ def test_what_ended_the_detector_is_refused_at_its_door(
 
 
 def test_a_good_map_is_taken_as_it_is() -> None:
-    taken = received.map_points(cloud())
+    taken = received_maps.map_points(cloud())
     assert taken.stamp == 17
     np.testing.assert_array_equal(taken.points, POINTS)
     np.testing.assert_array_equal(taken.normals, NORMALS)
-    assert received.map_points(cloud(normals=None)).normals is None
-    path = received.keyframe_poses(poses(4))
+    assert received_maps.map_points(cloud(normals=None)).normals is None
+    path = received_maps.keyframe_poses(poses(4))
     assert (path.stamp, path.stamps.tolist(), path.map_from_camera.shape) == (17, [0, 1, 2, 3], (4, 4, 4))
-    assert len(received.keyframe_poses(poses(0)).stamps) == 0
+    assert len(received_maps.keyframe_poses(poses(0)).stamps) == 0
     status = SfmStatus(map_revision=3, map_stamp=messages.time_msg(STAMP), scale_source="board", scale_sigma=0.001)
-    assert received.sfm_status(status) == received.ReceivedStatus(17, 3, "board", 0.001)
+    assert received_maps.sfm_status(status) == received_maps.ReceivedStatus(17, 3, "board", 0.001)
 
 
 def test_velocities_come_as_they_were_sent() -> None:
     header = messages.header(17, "map")
     linear = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
     angular = np.negative(linear)
-    taken = received.keyframe_velocities(messages.keyframe_velocities(header, 0.015, linear, angular))
+    taken = received_maps.keyframe_velocities(messages.keyframe_velocities(header, 0.015, linear, angular))
     assert (taken.stamp, taken.readout) == (17, 0.015)
     np.testing.assert_array_equal(taken.linear, linear)
     np.testing.assert_array_equal(taken.angular, angular)
@@ -145,7 +145,7 @@ def test_velocities_come_as_they_were_sent() -> None:
 def test_single_points_that_are_nowhere_are_left_out() -> None:
     points, normals = POINTS.copy(), NORMALS.copy()
     points[1, 2], points[5, 0], points[7, 1], normals[9] = np.nan, -np.inf, 3.0 * MAX_COORDINATE, np.nan
-    taken = received.map_points(cloud(points, normals))
+    taken = received_maps.map_points(cloud(points, normals))
     kept = np.delete(np.arange(20), [1, 5, 7, 9])
     np.testing.assert_array_equal(taken.points, points[kept])
     np.testing.assert_array_equal(taken.normals, normals[kept])
@@ -156,14 +156,14 @@ def test_a_cloud_beyond_the_limits_is_refused_before_its_data_are_touched() -> N
     message = changed(cloud(), "width", size)
     message.height = size + 1
     with pytest.raises(InvalidMessageError, match="too large"):
-        received.map_points(message)
+        received_maps.map_points(message)
     message.width = message.height = 2**32 - 1  # 2^64 points overflow 64 bits
     with pytest.raises(InvalidMessageError, match="too large"):
-        received.map_points(message)
+        received_maps.map_points(message)
     message = cloud()
     message.fields += [PointField(name=f"f{n}", datatype=PointField.UINT8, count=1) for n in range(MAX_CLOUD_FIELDS)]
     with pytest.raises(InvalidMessageError, match="fields"):
-        received.map_points(message)
+        received_maps.map_points(message)
 
 
 def test_rows_of_an_ordered_cloud_may_be_padded() -> None:
@@ -171,10 +171,10 @@ def test_rows_of_an_ordered_cloud_may_be_padded() -> None:
     message = changed(cloud(), "height", 4)
     message.width, message.row_step = 5, rows.shape[1] + 3
     message.data = array("B", np.pad(rows, ((0, 0), (0, 3))).tobytes())
-    np.testing.assert_array_equal(received.map_points(message).points, POINTS)
+    np.testing.assert_array_equal(received_maps.map_points(message).points, POINTS)
     message.row_step = rows.shape[1] - 1
     with pytest.raises(InvalidMessageError, match="damaged"):
-        received.map_points(message)
+        received_maps.map_points(message)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_rows_of_an_ordered_cloud_may_be_padded() -> None:
 )
 def test_poses_that_no_survey_has_are_refused(message: Path, kind: str) -> None:
     with pytest.raises(InvalidMessageError) as refusal:
-        received.keyframe_poses(message)
+        received_maps.keyframe_poses(message)
     assert refusal.value.kind == kind
 
 
@@ -208,12 +208,12 @@ def test_poses_that_no_survey_has_are_refused(message: Path, kind: str) -> None:
 )
 def test_a_status_that_no_survey_has_is_refused(change: dict[str, object], kind: str) -> None:
     with pytest.raises(InvalidMessageError) as refusal:
-        received.sfm_status(SfmStatus(**({"map_revision": 1, "scale_sigma": 0.1} | change)))
+        received_maps.sfm_status(SfmStatus(**({"map_revision": 1, "scale_sigma": 0.1} | change)))
     assert refusal.value.kind == kind
 
 
 def test_before_the_first_map_there_is_no_scale() -> None:
-    assert received.sfm_status(SfmStatus(scale_sigma=np.nan)).revision == 0
+    assert received_maps.sfm_status(SfmStatus(scale_sigma=np.nan)).revision == 0
 
 
 @given(
@@ -236,7 +236,9 @@ def test_before_the_first_map_there_is_no_scale() -> None:
 )
 def test_any_cloud_is_taken_with_finite_points_or_refused(data: bytes, **values: Any) -> None:
     try:
-        taken = received.map_points(PointCloud2(header=messages.header(STAMP, "map"), data=array("B", data), **values))
+        taken = received_maps.map_points(
+            PointCloud2(header=messages.header(STAMP, "map"), data=array("B", data), **values)
+        )
     except InvalidMessageError:
         return
     assert np.abs(taken.points).max() <= MAX_COORDINATE

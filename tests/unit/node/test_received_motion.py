@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a robot's motion and of retired keyframes: what is taken of them, and under which kind one is dropped."""
+"""Messages of a robot's motion: what is taken of them, and under which kind one is dropped."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from pipeprog_camera.limits import MAX_COORDINATE, MAX_NAME, MAX_POSES, MAX_QUATERNION_ERROR, MAX_SECONDS
-from pipeprog_msgs.msg import KeyframesRetired
-from pipeprog_node import received
+from pipeprog_camera.limits import MAX_COORDINATE, MAX_NAME, MAX_QUATERNION_ERROR, MAX_SECONDS
+from pipeprog_node import received_header, received_motion
 from pipeprog_node.intake import InvalidMessageError
 
 TURN = math.sqrt(0.5)
@@ -50,7 +49,7 @@ def imu(force: tuple[float, float, float], covariance: float = 0.1, frame: str =
 
 
 def test_odometry_is_a_transform_between_two_frames() -> None:
-    taken = received.odometry(odometry(parent="/odom"))
+    taken = received_motion.odometry(odometry(parent="/odom"))
     assert (taken.stamp, taken.parent, taken.child) == (5_000_000_007, "odom", "base")
     expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     assert np.allclose(taken.parent_from_child, expected, atol=1e-12)
@@ -82,56 +81,43 @@ def test_odometry_is_a_transform_between_two_frames() -> None:
 )
 def test_odometry_that_is_no_motion_is_refused(changes: dict[str, Any], kind: str) -> None:
     with pytest.raises(InvalidMessageError) as caught:
-        received.odometry(odometry(**changes))
+        received_motion.odometry(odometry(**changes))
     assert caught.value.kind == kind
     assert len(str(caught.value)) < 4 * MAX_NAME
 
 
 def test_a_quaternion_typed_with_two_decimals_is_a_rotation() -> None:
-    pose = received.odometry(odometry(quaternion=(0.0, 0.71, 0.0, 0.71))).parent_from_child
+    pose = received_motion.odometry(odometry(quaternion=(0.0, 0.71, 0.0, 0.71))).parent_from_child
     assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
 
 
 def test_the_last_stamp_taken_leaves_room_for_a_nanosecond() -> None:
-    last = received.checked_stamp(Time(sec=MAX_SECONDS - 1, nanosec=999_999_999))
+    last = received_header.checked_stamp(Time(sec=MAX_SECONDS - 1, nanosec=999_999_999))
     Time(sec=(last + 1) // 10**9, nanosec=(last + 1) % 10**9)
 
 
 def test_a_bad_transform_does_not_drop_the_others() -> None:
-    taken = received.transforms(TFMessage(transforms=[edge("one"), edge("two", (0.0, 0.0, 0.0, 0.0)), edge("three")]))
+    taken = received_motion.transforms(
+        TFMessage(transforms=[edge("one"), edge("two", (0.0, 0.0, 0.0, 0.0)), edge("three")])
+    )
     assert [each.child for each in taken.transforms] == ["one", "three"]
     assert [error.kind for error in taken.refused] == ["rotation"]
 
 
 def test_too_many_transforms_in_one_message_are_refused() -> None:
     with pytest.raises(InvalidMessageError, match="1001 transforms"):
-        received.transforms(TFMessage(transforms=[edge("one")] * 1001))
+        received_motion.transforms(TFMessage(transforms=[edge("one")] * 1001))
 
 
 def test_an_imu_tells_what_it_feels() -> None:
-    taken = received.imu(imu((0.0, 0.0, 9.8)))
+    taken = received_motion.imu(imu((0.0, 0.0, 9.8)))
     assert taken.frame == "imu"
     assert taken.force is not None
     assert taken.force.tolist() == [0.0, 0.0, 9.8]
-    assert received.imu(imu((0.0, 0.0, 0.0), covariance=-1.0)).force is None
+    assert received_motion.imu(imu((0.0, 0.0, 0.0), covariance=-1.0)).force is None
 
 
 @pytest.mark.parametrize("force", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, 1e300)])
 def test_an_acceleration_that_no_robot_feels_is_refused(force: tuple[float, float, float]) -> None:
     with pytest.raises(InvalidMessageError, match="acceleration"):
-        received.imu(imu(force))
-
-
-def test_a_retirement_names_keyframes_that_a_survey_can_have() -> None:
-    header = Header(frame_id="camera")
-    message = KeyframesRetired(header=header, keyframes_published=3, stamps=[Time(sec=1), Time(sec=2, nanosec=5)])
-    assert received.retirement(message) == received.ReceivedRetirement(0, "camera", 3, (10**9, 2 * 10**9 + 5))
-    for changed, kind in (
-        (KeyframesRetired(keyframes_published=MAX_POSES + 1), "count"),
-        (KeyframesRetired(keyframes_published=2**32 - 1), "count"),
-        (KeyframesRetired(stamps=[Time()] * (MAX_POSES + 1)), "count"),
-        (KeyframesRetired(stamps=[Time(sec=-1)]), "stamp"),
-    ):
-        with pytest.raises(InvalidMessageError) as caught:
-            received.retirement(changed)
-        assert caught.value.kind == kind
+        received_motion.imu(imu(force))

@@ -11,8 +11,7 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 
 from pipeprog_camera.camera import Camera
-from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray
-from pipeprog_node import messages, received
+from pipeprog_node import messages, received_images
 from pipeprog_node.intake import InvalidMessageError
 
 CAMERA = Camera(1280, 720, 900.0, 901.0, 639.5, 359.5, "plumb_bob", (-0.2, 0.05, 0.001, -0.0005, 0.0))
@@ -27,7 +26,7 @@ def info(**changes: Any) -> CameraInfo:
 
 
 def test_a_calibration_is_taken_with_its_stamp_and_frame() -> None:
-    assert received.camera_info(info()) == received.ReceivedCamera(17, "camera", CAMERA)
+    assert received_images.camera_info(info()) == received_images.ReceivedCamera(17, "camera", CAMERA)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +60,7 @@ def test_a_calibration_is_taken_with_its_stamp_and_frame() -> None:
 )
 def test_a_calibration_of_no_camera_is_refused(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(InvalidMessageError, match=words) as raised:
-        received.camera_info(info(**changes))
+        received_images.camera_info(info(**changes))
     assert raised.value.kind == "calibration"
     assert len(str(raised.value)) < 400
 
@@ -83,7 +82,7 @@ RATIONAL = (0.5, -2.7, 4e-4, -1e-4, 1.6, 0.4, -2.5, 1.5)
     ],
 )
 def test_unusual_cameras_are_taken(camera: Camera) -> None:
-    assert received.camera_info(messages.info_from_camera(camera, 17, "camera")).camera == camera
+    assert received_images.camera_info(messages.info_from_camera(camera, 17, "camera")).camera == camera
 
 
 @pytest.mark.parametrize("stamp", [Time(sec=-1), Time(sec=1, nanosec=1_000_000_000)])
@@ -91,7 +90,7 @@ def test_a_stamp_that_is_no_time_is_refused(stamp: Time) -> None:
     message = info()
     message.header.stamp = stamp
     with pytest.raises(InvalidMessageError, match="stamp the message") as raised:
-        received.camera_info(message)
+        received_images.camera_info(message)
     assert raised.value.kind == "stamp"
 
 
@@ -108,7 +107,7 @@ def raw(**changes: Any) -> Image:
 
 def test_a_raw_image_is_taken_without_a_copy() -> None:
     message = raw()
-    image = received.raw_image(message)
+    image = received_images.raw_image(message)
     assert (image.stamp, image.frame_id) == (17, "camera")
     np.testing.assert_array_equal(image.pixels, GREY)
     assert np.shares_memory(image.pixels, np.frombuffer(message.data, np.uint8))
@@ -130,43 +129,6 @@ def test_a_raw_image_is_taken_without_a_copy() -> None:
 )
 def test_a_raw_image_whose_fields_do_not_fit_is_refused(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(InvalidMessageError, match=words) as raised:
-        received.raw_image(raw(**changes))
+        received_images.raw_image(raw(**changes))
     assert raised.value.kind == "image"
     assert len(str(raised.value)) < 300
-
-
-def overlaps(**changes: Any) -> ImageOverlapArray:
-    image = ImageOverlap(stamp=Time(sec=3), registered=True, overlap=0.5, cell_overlap=0.25)
-    for name, value in changes.items():
-        setattr(image, name, value)
-    return ImageOverlapArray(
-        header=messages.header(17, "camera"), keyframes_considered=4, retirements_considered=1, images=[image]
-    )
-
-
-def test_overlaps_are_taken_as_they_are() -> None:
-    image = received.ReceivedOverlap(3_000_000_000, True, 0.5, 0.25, 0, 0)
-    assert received.image_overlaps(overlaps()) == received.ReceivedOverlaps(17, 4, 1, (image,))
-
-
-@pytest.mark.parametrize(
-    ("changes", "kind"),
-    [
-        ({"overlap": float("nan")}, "overlap"),
-        ({"overlap": float("inf")}, "overlap"),
-        ({"cell_overlap": -0.1}, "overlap"),
-        ({"cell_overlap": 1.1}, "overlap"),
-        ({"stamp": Time(sec=-1)}, "stamp"),
-    ],
-)
-def test_overlaps_that_are_no_shares_are_refused(changes: dict[str, Any], kind: str) -> None:
-    with pytest.raises(InvalidMessageError) as raised:
-        received.image_overlaps(overlaps(**changes))
-    assert raised.value.kind == kind
-
-
-def test_more_answers_than_a_survey_has_keyframes_are_refused() -> None:
-    message = overlaps()
-    message.keyframes_considered = 2**32 - 1
-    with pytest.raises(InvalidMessageError, match="answer to 4294967295 keyframes"):
-        received.image_overlaps(message)
