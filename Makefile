@@ -56,7 +56,7 @@ $(VENV)/.video: $(VENV)/.packages requirements-video.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt -r requirements-video.txt
 	@touch $@
 
-$(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(wildcard setup/tf2_msgs/* setup/tf2_msgs/msg/*) $(INTERFACES) $(PACKAGES)
+$(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(wildcard setup/*_msgs/* setup/*_msgs/msg/* setup/*_msgs/action/*) $(INTERFACES) $(PACKAGES)
 	@$(SHELL) setup/build.sh $(VENV)
 	@touch $@
 

@@ -45,6 +45,7 @@ GLUE = {
     "pipeprog_bringup": {
         *{"replay", "session", "connections", "player", "listener", "survey_writer"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output"},
+        *{"survey_client", "conduct"},
     },
 }
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
@@ -73,9 +74,10 @@ FOLDERS = {
         "playback": {"recording", "results"},
         "commands": {  # as thin as they are, they stand above all
             *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
-            *("console", "footage", "plane_from_keyframe", "recording", "recording_check", "comparison"),
+            *("console", "footage", "plane_from_keyframe", "recording", "recording_check", "comparison", "patrol"),
         },
         "survey": {"playback", "recording", "results"},
+        "patrol": {"results"},
     },
 }
 LICENCE = "# SPDX-License-Identifier: Apache-2.0"

@@ -21,6 +21,7 @@ from pipeprog_bringup.commands.detect import detect
 from pipeprog_bringup.commands.export import export
 from pipeprog_bringup.commands.fleet import fleet
 from pipeprog_bringup.commands.ingest import ingest
+from pipeprog_bringup.commands.patrol import patrol
 from pipeprog_bringup.commands.replay import replay
 from pipeprog_bringup.commands.report import report
 from pipeprog_bringup.commands.score import score
@@ -38,6 +39,7 @@ app = typer.Typer(
 )
 for panel, commands in {
     "From recordings": (check, replay, fleet, detect),
+    "On a robot": (patrol,),
     "To recordings": (ingest, board),
     "From results": (score, report, compare, view, export),
 }.items():

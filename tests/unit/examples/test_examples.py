@@ -3,25 +3,40 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rclpy
 
 from pipeprog_bringup.results import result_files
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe
+from tests.unit.bringup.patrol.fake_robot import FakeRobot, fake_robot
+from tests.unit.examples import fake_spot_sdk
 
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.fixture
+def robot() -> Iterator[FakeRobot]:
+    with fake_robot() as robot:
+        yield robot
+
+
+def run(name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=280, check=False)
+
+
 def example(name: str, *arguments: str | Path) -> list[str]:
     """The lines that a program prints."""
-    command = [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=280, check=False)
+    result = run(name, *arguments)
     assert result.returncode == 0, result.stderr
     return result.stdout.splitlines()
 
@@ -64,6 +79,67 @@ def test_read_results_into_pandas(tmp_path: Path) -> None:
     (row,) = (line.split() for line in lines if line.startswith("p01"))
     assert [float(cell) for cell in row[2:]] == [0.0367, 0.0001, 2.0, 1.5, 0.75]
     assert lines[-1].split() == ["DN65", "2", "3.5"]
+
+
+def test_nav2_waypoints(robot: FakeRobot) -> None:
+    waypoints = ("--at", "1", "2", "90", "--at", "6", "2", "90", "--at", "9", "2", "0")
+    assert example("nav2_waypoints.py", *waypoints, "--survey-id", "monday") == ["results: /surveys/monday"]
+    assert robot.said == ["follow 1", "survey monday", "follow 6 9", "end"]
+
+    robot.said.clear()
+    robot.blocked = {"9"}
+    missed = run("nav2_waypoints.py", *waypoints, "--survey-id", "tuesday")
+    assert missed.returncode == 1
+    assert "missed waypoints [1]" in missed.stderr
+    assert missed.stdout == "results: /surveys/tuesday\n"  # what was filmed has its results
+    assert robot.said[-1] == "end"
+
+
+def test_spot_navigate_to(robot: FakeRobot) -> None:
+    walk = ("begin", "middle", "end_of_wall", "--home", "dock", "--survey-id", "monday")
+    assert example("spot_navigate_to.py", *walk) == ["results: /surveys/monday"]
+    assert robot.said == ["walk begin", "survey monday", "walk middle", "walk end_of_wall", "end", "walk dock"]
+
+    robot.said.clear()
+    robot.blocked = {"middle"}
+    stuck = run("spot_navigate_to.py", *walk)
+    assert stuck.returncode == 1
+    assert "not come to middle: no way" in stuck.stderr
+    assert robot.said == ["walk begin", "survey monday", "walk middle", "end", "walk dock"]
+
+
+def test_spot_remote_mission(robot: FakeRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, module in fake_spot_sdk.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    program = runpy.run_path(str(ROOT / "examples" / "spot_remote_mission.py"))
+    client = program["SurveyClient"](rclpy.create_node("mission"), start_seconds=5.0)
+    mission = program["SurveyMission"](client)
+
+    def action() -> list[str]:
+        """The states that an action of the walk goes through."""
+        session = mission.EstablishSession(fake_spot_sdk.Request(), None).session_id
+        states: list[str] = []
+        while not states or states[-1] == "RUNNING":
+            answer = mission.Tick(fake_spot_sdk.Request(session), None)
+            states.append(fake_spot_sdk.TICKED[answer.status] + answer.error_message)
+        assert mission.TeardownSession(fake_spot_sdk.Request(session), None).status == 1
+        return states
+
+    robot.failing = ["", "no board was seen"]
+    try:
+        assert action() == ["SUCCESS"]
+        assert robot.said[0].startswith("survey")
+        assert action()[-1] == "SUCCESS"
+        assert robot.said[1] == "end"
+        assert action() == ["SUCCESS"]
+        assert action()[-1] == "FAILUREno board was seen"
+    finally:
+        client.close()
+
+
+def test_programs_for_robots_have_at_most_a_hundred_lines() -> None:
+    for name in ("nav2_waypoints", "spot_navigate_to", "spot_remote_mission"):
+        assert len((ROOT / "examples" / f"{name}.py").read_text().splitlines()) <= 100, name
 
 
 def test_every_example_has_its_test() -> None:
