@@ -10,6 +10,7 @@ from string import ascii_uppercase
 from typing import Any
 
 from pipeprog_bringup.comparison.comparison import Step
+from pipeprog_bringup.report.schedule import Line, Zone, lines, sentence, zones
 from pipeprog_bringup.report.survey_reader import Survey
 from pipeprog_bringup.results.results_reader import Color
 
@@ -56,6 +57,9 @@ class Summary:
         previous: date of the survey before.
         rows: the planned classes.
         unplanned: number of pipes of no planned class, and their metres.
+        lines: the lines of the bill, where they say more than their classes.
+        zones: metres by zone, where the bill has zones.
+        schedule: how the metres stand against the dates of the bill, as a sentence; empty without dates.
         seen: what was not seen, as a sentence; empty where the results do not tell.
         warnings: what to doubt, one sentence each.
     """
@@ -68,6 +72,9 @@ class Summary:
     previous: str
     rows: list[ClassRow]
     unplanned: tuple[int, float]
+    lines: list[Line]
+    zones: list[Zone]
+    schedule: str
     seen: str
     warnings: list[str]
 
@@ -104,15 +111,21 @@ def summary(surveys: Sequence[Survey], step: Step | None = None, not_compared: s
     rows = [_row(number, newest, previous, entry, step) for number, entry in enumerate(newest.classes)]
     unplanned = [float(pipe["length"]) for pipe in newest.pipes if pipe["class"] is None]
     changes = [row.change for row in rows if row.change is not None]
+    days = None if previous is None else (newest.time - previous.time).total_seconds() / DAY
+    rates = {row.name: row.change / days for row in rows if row.change is not None and days}
+    bill = lines(newest, rates)
     return Summary(
         planned=sum(row.planned for row in rows),
         installed=sum(row.installed for row in rows),
         sigma=_joined_sigma(rows, newest.scale.get("sigma")),
         change=sum(changes) if changes else None,
-        days=None if previous is None else (newest.time - previous.time).total_seconds() / DAY,
+        days=days,
         previous="" if previous is None else f"{previous.time:%Y-%m-%d}",
         rows=rows,
         unplanned=(len(unplanned), sum(unplanned)),
+        lines=bill,
+        zones=zones(bill),
+        schedule=sentence(bill),
         seen=_seen(newest),
         warnings=_warnings(newest, rows)
         + ([f"Metres are compared, not pipes: {not_compared}"] if not_compared else []),

@@ -43,6 +43,7 @@ def of_planned(each: PlannedCoverage) -> dict[str, Any]:
         "id": planned.id,
         "name": planned.name,
         "class": planned.class_name,
+        "line": planned.line,
         "state": each.word,
         "planned_m": _metres(planned.cylinder.length),
         "installed_m": _metres(each.state.length),

@@ -134,6 +134,8 @@ def _check_planned(row: dict[str, Any], where: str) -> None:
             raise InputError(f"{key} of {where} is {shown(row.get(key))}, not a text")
     for key in ("planned_m", "installed_m", *COVERAGE_KEYS):
         number(row, key, where)
+    if not isinstance(row.get("line", 0), int):
+        raise InputError(f"line of {where} is {shown(row['line'])}, not the number of a line of its class")
 
 
 def _check_end(row: dict[str, Any], where: str) -> None:

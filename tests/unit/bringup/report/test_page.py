@@ -174,6 +174,25 @@ def test_without_places_the_walls_are_told(tmp_path: Path) -> None:
     assert "Thin coverage" not in text
 
 
+def test_zones_and_dates_of_the_bill_are_told(tmp_path: Path) -> None:
+    folder = survey(tmp_path / "run")
+    line = {
+        "name": "riser <1>",
+        "planned_length_m": 4.0,
+        "zone": "level 2",
+        "start": "2023-11-04",
+        "finish": "2023-11-24",
+    }
+    result_files.write_config(
+        folder / "config.yaml", {"boq": [{"name": "DN<200>", "color": "#ff0000", "lines": [line]}]}
+    )
+    _, shown = read(report([folder], tmp_path / "page.html", False, silent))
+    assert "On schedule" in shown
+    assert "level 2" in shown
+    assert "riser <1>" in shown
+    assert "2023-11-24" in shown
+
+
 def test_a_survey_that_stopped_early_is_warned_of(tmp_path: Path) -> None:
     folder = survey(tmp_path / "a")
     (folder / "run.json").write_text(json.dumps({"frames_in_bag": 65, "frames_considered": 40}))
