@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from pipeprog_bringup.report.render import LIFT
 from pipeprog_bringup.report.survey_reader import Survey
+from pipeprog_bringup.results.plan_file import read_plan
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
 
@@ -66,12 +67,13 @@ def cloud_bytes(cloud: Thinned) -> dict[str, Any]:
 
 
 def view(survey: Survey, previous: Survey | None, letters: Sequence[str]) -> dict[str, Any]:
-    """Pipes, cameras and the pipes of the survey before, as plain values."""
+    """Pipes, cameras, planned pipes that are not installed and the pipes of the survey before, as plain values."""
     poses = survey.results.map_from_camera
     shown = poses[:: -(-len(poses) // MOST_CAMERAS)] if len(poses) else poses
     return {
         "pipes": _pipes(survey, letters),
         "cameras": np.round(shown[:, :3].reshape(-1, 12), 4).tolist(),
+        "planned": _planned(survey),
         "previous": [] if previous is None else _pipes(previous, [""] * len(previous.pipes)),
     }
 
@@ -89,6 +91,25 @@ def _pipes(survey: Survey, letters: Sequence[str]) -> list[dict[str, Any]]:
             "color": list(survey.color(pipe["class"])),
         }
         for pipe, own in zip(survey.pipes, letters, strict=True)
+    ]
+
+
+def _planned(survey: Survey) -> list[dict[str, Any]]:
+    """Planned pipes with places of which most is not installed; none where the plan has no places."""
+    path = survey.results.folder / "plan.json"
+    states = {row["id"]: row["state"] for row in survey.results.planned}
+    if not path.is_file():
+        return []
+    return [
+        {
+            "id": pipe.id,
+            "start": pipe.cylinder.start.tolist(),
+            "end": pipe.cylinder.end.tolist(),
+            "radius": pipe.cylinder.radius,
+            "color": list(survey.color(pipe.class_name)),
+        }
+        for pipe in read_plan(path)
+        if states.get(pipe.id) not in (None, "installed")
     ]
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from pipeprog_bringup.report.page import report
 from pipeprog_bringup.report.paper import print_page
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.cloud_io import write_ply
+from pipeprog_bringup.results.plan_file import write_plan
+from pipeprog_detect.product.boq import PlannedPipe
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Pipe
@@ -36,9 +39,20 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pipes = [Pipe(f"p0{k}", c, 1e-4, names[k], 1.0, 2.5, 1e-3, 900) for k, c in enumerate((UPRIGHT, LEVEL))]
     classes = [ClassProgress(name, 0.05, 10.0, 6.2, 62.0) for name in names]
     result_files.write_pipes(folder / "pipes.json", Product(pipes, classes, []), result_files.Scale("board", 0.0004))
+    plan(folder, names[1])
     wall = np.random.default_rng(0).uniform([-1, 2.1, -1], [1, 2.11, 1], (5000, 3))
     write_ply(folder / "cloud.ply", wall, np.full((5000, 3), 120, np.uint8))
     return report([folder], tmp_path_factory.mktemp("page") / "report.html", False, lambda share, stage: None)
+
+
+def plan(folder: Path, class_name: str) -> None:
+    """One planned pipe that is installed and one that is missing."""
+    content = json.loads((folder / "pipes.json").read_text())
+    metres = dict.fromkeys(("planned_m", "installed_m", "missing_m", "unclear_m", "hidden_m", "not_seen_m"), 0.0)
+    states = {"there": "installed", "still to come": "missing"}
+    content["planned"] = [{"id": i, "name": i, "class": class_name, "state": s, **metres} for i, s in states.items()]
+    (folder / "pipes.json").write_text(json.dumps(content))
+    write_plan(folder / "plan.json", [PlannedPipe(name, name, LEVEL, class_name, 0) for name in states])
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +174,7 @@ def test_keys_choose_and_turn(browser: Browser, page: Path) -> None:
 def test_each_kind_is_one_draw_call(browser: Browser, page: Path) -> None:
     browser.open(page, *DESKTOP)
     drawn = browser.run("reportView.drawn()")
-    assert drawn["calls"] == 3, "cloud, pipes, cameras"
+    assert drawn["calls"] == 4, "cloud, pipes, planned pipes, cameras"
     assert drawn["points"] == 5000
 
 
@@ -170,3 +184,10 @@ def test_without_webgl_the_still_stays(tmp_path: Path, page: Path) -> None:
         left, _, right, _ = box(browser, "#still")
         assert right - left > 300
         assert not browser.run("document.querySelector('canvas')")
+
+
+def test_planned_pipes_that_are_not_installed_stand_in_the_view(page: Path, browser: Browser) -> None:
+    browser.open(page, *DESKTOP)
+    assert "planned, not installed" in browser.run("document.getElementById('layers').textContent")
+    planned = browser.run("JSON.parse(document.getElementById('view-data').textContent).planned")
+    assert [pipe["id"] for pipe in planned] == ["still to come"]

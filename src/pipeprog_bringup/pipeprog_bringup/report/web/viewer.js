@@ -6,7 +6,7 @@ const frame = document.getElementById("view");
 const rows = [...document.querySelectorAll(".pipe")];
 const panel = document.getElementById("selected");
 const read = (id) => JSON.parse(document.getElementById(id).textContent);
-const {pipes, cameras, previous} = read("view-data");
+const {pipes, cameras, planned, previous} = read("view-data");
 
 let renderer;
 try {
@@ -90,7 +90,8 @@ function frusta() {
 const own = (pipe) => new THREE.Color().setRGB(...pipe.color, "srgb");
 const solid = cylinders(pipes, new THREE.MeshLambertMaterial(), own);
 const ghosts = cylinders(previous, new THREE.MeshBasicMaterial({transparent: true, opacity: 0.35}), () => new THREE.Color(0.35, 0.35, 0.4));
-const layers = {"cloud": cloud(), "pipes": solid, "cameras": frusta(), "pipes of the survey before": ghosts};
+const plans = cylinders(planned, new THREE.MeshBasicMaterial({transparent: true, opacity: 0.3}), own);
+const layers = {"cloud": cloud(), "pipes": solid, "cameras": frusta(), "planned, not installed": plans, "pipes of the survey before": ghosts};
 for (const [name, object] of Object.entries(layers)) {
   if (!object) continue;
   scene.add(object);
