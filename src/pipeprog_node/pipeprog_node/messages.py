@@ -8,7 +8,7 @@ from array import array
 import cv2
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform, TransformStamped, Twist, Vector3
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -138,6 +138,14 @@ def path(path_header: Header, stamps: NDArray[np.int64], map_from_camera: NDArra
         message = Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
         poses.append(PoseStamped(header=header(stamp, path_header.frame_id), pose=message))
     return Path(header=path_header, poses=poses)
+
+
+def transform(stamp: int, parent: str, child: str, parent_from_child: NDArray[np.float64]) -> TransformStamped:
+    """A rigid transform (4, 4) [m] between two frames at a time [ns]."""
+    x, y, z = map(float, parent_from_child[:3, 3])
+    qx, qy, qz, qw = map(float, Rotation.from_matrix(parent_from_child[:3, :3]).as_quat())
+    moved = Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    return TransformStamped(header=header(stamp, parent), child_frame_id=child, transform=moved)
 
 
 def keyframe_velocities(

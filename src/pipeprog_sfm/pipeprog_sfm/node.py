@@ -38,6 +38,7 @@ from pipeprog_node.received_motion import ReceivedAcceleration, ReceivedTransfor
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
+from pipeprog_sfm.camera_transforms import FRAME, CameraTransforms
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
@@ -67,10 +68,12 @@ class MotionInput:
 
     A message that cannot be used counts, too: a replay waits for all of them.
     reliable: no message may be lost, as in a replay; live, drivers send best effort.
+    ignored: transforms from this frame are no motion of the robot's: it is `map` where the node publishes them itself.
     """
 
-    def __init__(self, intake: Intake, reliable: bool) -> None:
+    def __init__(self, intake: Intake, reliable: bool, ignored: str | None = None) -> None:
         self.considered = 0
+        self._ignored = ignored
         self._intake = intake
         # Since the last keyframe; static transforms by their child, since the newest counts.
         self._moving: deque[Transform] = deque(maxlen=MAX_WAITING_MOTION)
@@ -113,7 +116,8 @@ class MotionInput:
         for error in message.refused:
             self._intake.reject(topic, error)
         for transform in message.transforms:
-            self._add(topic, transform)
+            if transform.parent != self._ignored:
+                self._add(topic, transform)
 
     def _add(self, topic: str, edge: ReceivedTransform) -> None:
         if not self._knows(topic, edge.parent, edge.child):
@@ -250,7 +254,7 @@ class SfmNode(Node):
 
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("sfm", parameter_overrides=list(overrides))
-        config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep", "intermediate"))
+        config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep", "intermediate", "publish_tf"))
         board = declare_fixed(self, "board", "", "file of the boards on site")
         intermediate = declare_fixed(
             self, "intermediate", True, "publish maps while keyframes come, not the last alone"
@@ -258,11 +262,13 @@ class SfmNode(Node):
         self._arguments = config, load_board_file(board) if board else BoardFile(), intermediate
         self._colmap = declare_fixed(self, "colmap", "", "folder for the sparse model")
         self._lockstep = declare_fixed(self, "lockstep", False, "every message counts, as in a replay")
+        publish_tf = declare_fixed(self, "publish_tf", False, "publish map -> camera of the keyframes on /tf")
+        self._transforms = CameraTransforms(self) if publish_tf else None
         self._supervision = Supervision(self._start_worker, "the reconstruction process")
         self._done = self._dropped = self._retired = 0  # keyframes answered, keyframes left out, Retires answered
         self._output = MapOutput(self)
         self._intake = Intake(self)
-        self._motion = MotionInput(self._intake, reliable=self._lockstep)
+        self._motion = MotionInput(self._intake, self._lockstep, ignored=FRAME if publish_tf else None)
         self._keyframes = KeyframeInput(self._intake, self._on_keyframe)
         self._status = Status()
         self._motion_published = 0  # messages of motion that the last status counts
@@ -340,11 +346,15 @@ class SfmNode(Node):
             self._publish_overlap(event.overlaps, messages.header(event.stamp, event.frame))
             if event.trajectory is not None:
                 self._output.publish_poses(event.trajectory)
+                if self._transforms:
+                    self._transforms.publish(event.trajectory, self._camera_frame)
         elif isinstance(event, Retired):
             self._supervision.answered()
             self._end_retirement(event.overlaps)
         elif isinstance(event, MapReady):
             self._output.publish_map(event.map, self._camera_frame)
+            if self._transforms:
+                self._transforms.publish(event.map.trajectory, self._camera_frame)
         self._publish_status()
         if isinstance(event, Finished):
             self._supervision.fulfilled()

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the camera stands in `map`, on /tf: viewers then show its images and a robot's other sensors in the map."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+from tf2_msgs.msg import TFMessage
+
+from pipeprog_node import messages, qos
+from pipeprog_sfm.reconstruction import Trajectory
+
+FRAME = "map"
+DEPTH = 100  # as tf2's own broadcasters
+
+
+class CameraTransforms:
+    """Publishes the transform from `map` to the camera's optical frame, one for each keyframe, stamped as its image.
+
+    A robot whose localisation owns the tree must not have it: a frame of tf2 has one parent.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._publisher = node.create_publisher(TFMessage, "/tf", qos.reliable(DEPTH))
+        self._last = -1
+
+    def publish(self, trajectory: Trajectory, camera_frame: str) -> None:
+        """The place of the newest keyframe, once: tf2 keeps the first transform of a stamp."""
+        newest = int(trajectory.stamps.argmax())
+        stamp = int(trajectory.stamps[newest])
+        if stamp <= self._last:
+            return
+        self._last = stamp
+        moved = messages.transform(stamp, FRAME, camera_frame, trajectory.map_from_camera[newest])
+        self._publisher.publish(TFMessage(transforms=[moved]))
