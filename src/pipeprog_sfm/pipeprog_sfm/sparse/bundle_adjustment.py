@@ -81,16 +81,18 @@ def adjust(
     start, view = bundle.start, bundle.view
     index = np.where(free, np.cumsum(free) - 1, -1)
     count = int(free.sum())
-    pairs, row, column = _pairs(start, view, index, count)
+    pairs, row, column = pairs_of_views(start, view, index, count)
     cost = _cost(*bundle.arrays(), loss_scale)
     damping = INITIAL_DAMPING
     for _ in range(max_iterations):
         u, gc, v, gp, w = _linearise(*bundle.arrays(), index, count, loss_scale)
         gained = 0.0
         for _ in range(MAX_DAMPINGS):
-            blocks, gradient, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(row), damping)
+            blocks, gradient, v_inverse = eliminate_points(
+                u, gc, v, gp, w, start, view, index, pairs, len(row), damping
+            )
             step = _solve(blocks, row, column, gradient).reshape(-1, 6)
-            moves = _back_substitute(step, gp, w, v_inverse, start, view, index)
+            moves = moves_of_points(step, gp, w, v_inverse, start, view, index)
             candidate = bundle.moved(index, step, moves)
             new_cost = _cost(*candidate.arrays(), loss_scale)
             if new_cost < cost:
@@ -113,15 +115,11 @@ def function_covariance(gradients: FloatArray, bundle: Bundle, *, loss_scale: fl
     features of one point have in common, and residuals larger than the noise, are included.
     """
     start, view, count = bundle.start, bundle.view, len(bundle.rotation)
-    centres = -np.einsum("cji,cj->ci", bundle.rotation, bundle.translation)
     index = np.append(np.arange(count - 1), -1)  # the last pose fixes the model's position and orientation
-    pairs, row, column = _pairs(start, view, index, count - 1)
+    pairs, row, column = pairs_of_views(start, view, index, count - 1)
     u, gc, v, gp, w = _linearise(*bundle.arrays(), index, count - 1, loss_scale)
-    blocks, _, v_inverse = _reduce(u, gc, v, gp, w, start, view, index, pairs, len(row), 0.0)
-    # One coordinate of the pose farthest from it fixes the scale.
-    far = int(np.linalg.norm(centres - centres[-1], axis=1).argmax())
-    axis = 3 + int(np.abs(bundle.rotation[far] @ (centres[far] - centres[-1])).argmax())
-    blocks[pairs[far, far], axis, axis] += HOLD * np.abs(blocks[pairs[far, far]]).max()
+    blocks, _, v_inverse = eliminate_points(u, gc, v, gp, w, start, view, index, pairs, len(row), 0.0)
+    hold_scale(blocks, pairs, index, bundle.rotation, bundle.translation)
 
     error = bundle.residuals()
     square = (error**2).sum(axis=1)
@@ -131,7 +129,7 @@ def function_covariance(gradients: FloatArray, bundle: Bundle, *, loss_scale: fl
         if not gradient.any():
             continue
         poses = _solve(blocks, row, column, gradient[:-1]).reshape(-1, 6)
-        moves = _back_substitute(poses, np.zeros_like(gp), w, v_inverse, start, view, index)
+        moves = moves_of_points(poses, np.zeros_like(gp), w, v_inverse, start, view, index)
         size = DIFFERENCE / max(float(np.abs(poses).max() * bundle.focal.max()), 1e-300)
         ends = [bundle.moved(index, step * poses, step * moves).residuals() for step in (size, -size)]
         derivative = (ends[0] - ends[1]) / (2 * size)
@@ -143,6 +141,26 @@ def function_covariance(gradients: FloatArray, bundle: Bundle, *, loss_scale: fl
     curvature = float((weight - square * weight**2 / loss_scale**2).mean() / weight.mean())
     freedom = 2 * len(view) - 3 * len(bundle.points)
     return scores @ scores.T / curvature**2 * freedom / max(freedom - 6 * count + 7, 1)
+
+
+def hold_scale(
+    blocks: FloatArray, pairs: NDArray[np.int32], index: IntArray, rotation: FloatArray, translation: FloatArray
+) -> None:
+    """Fixes the scale of a reduced system one of whose views stays: one coordinate of the view farthest from it.
+
+    Args:
+        blocks: upper (6, 6) blocks of the system, changed here.
+        pairs: number of the block of each pair of free views.
+        index: number of each view among the free ones, -1 for the one that stays.
+        rotation: (C, 3, 3) camera_from_world.
+        translation: (C, 3) camera_from_world.
+    """
+    centres = -np.einsum("cji,cj->ci", rotation, translation)
+    away = centres - centres[index < 0]
+    far = int(np.linalg.norm(away, axis=1).argmax())
+    axis = 3 + int(np.abs(rotation[far] @ away[far]).argmax())
+    block = blocks[pairs[index[far], index[far]]]
+    block[axis, axis] += HOLD * np.abs(block).max()
 
 
 def rotation_from_vector(vectors: FloatArray) -> FloatArray:
@@ -160,14 +178,16 @@ def rotation_from_vector(vectors: FloatArray) -> FloatArray:
 
 
 def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatArray) -> FloatArray:
-    """Solves the symmetric system given by its upper (6, 6) blocks.
+    """Solves the symmetric system given by its upper (6, 6) blocks."""
+    return factorised(blocks, row, column, len(gradient)).solve(gradient.ravel()) if len(gradient) else np.zeros(0)
+
+
+def factorised(blocks: FloatArray, row: IntArray, column: IntArray, count: int) -> scipy.sparse.linalg.SuperLU:
+    """What solves the symmetric system of `count` views given by its upper (6, 6) blocks.
 
     A sparse solver also for small, full systems: a dense solver's threads cost more than they gain, and the result's
     last bits would depend on their number. SuperLU holds the interpreter lock for a quarter of its factorisation.
     """
-    count = len(gradient)
-    if not count:
-        return np.zeros(0)
     off = row != column
     data = np.concatenate([blocks, blocks[off].transpose(0, 2, 1)])
     rows, columns = np.concatenate([row, column[off]]), np.concatenate([column, row[off]])
@@ -175,14 +195,13 @@ def _solve(blocks: FloatArray, row: IntArray, column: IntArray, gradient: FloatA
     i = np.broadcast_to(6 * rows[:, None, None] + six[None, :, None], data.shape).ravel()
     j = np.broadcast_to(6 * columns[:, None, None] + six[None, None, :], data.shape).ravel()
     sparse = scipy.sparse.csc_matrix((data.ravel(), (i, j)), shape=(6 * count, 6 * count))
-    solver = scipy.sparse.linalg.splu(
+    return scipy.sparse.linalg.splu(
         sparse, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )
-    return solver.solve(gradient.ravel())
 
 
 @njit(cache=True, nogil=True)
-def _pairs(start, view, index, count):  # type: ignore[no-untyped-def]  # compiled
+def pairs_of_views(start, view, index, count):  # type: ignore[no-untyped-def]  # compiled
     """Number of each pair of free views that see a common point, and the pairs in order."""
     pairs = np.full((count, count), -1, np.int32)
     for c in range(count):
@@ -286,7 +305,8 @@ def _linearise(rotation, translation, points, start, view, rays, focal, index, c
 
 
 @njit(cache=True, nogil=True)
-def _reduce(u, gc, v, gp, w, start, view, index, pairs, total, damping):  # type: ignore[no-untyped-def]  # compiled
+def eliminate_points(u, gc, v, gp, w, start, view, index, pairs, total, damping):  # type: ignore[no-untyped-def]  # compiled
+    """Upper blocks (total, 6, 6) and gradient of the poses' system, inverses (P, 3, 3) of the points' blocks."""
     blocks = np.zeros((total, 6, 6))
     gradient = gc.copy()
     v_inverse = np.zeros_like(v)
@@ -332,7 +352,8 @@ def _reduce(u, gc, v, gp, w, start, view, index, pairs, total, damping):  # type
 
 
 @njit(cache=True, nogil=True)
-def _back_substitute(step, gp, w, v_inverse, start, view, index):  # type: ignore[no-untyped-def]  # compiled
+def moves_of_points(step, gp, w, v_inverse, start, view, index):  # type: ignore[no-untyped-def]  # compiled
+    """(P, 3) moves of the points that go with a step of the poses."""
     moves = np.empty_like(gp)
     g = np.empty(3)
     for p in range(len(gp)):

@@ -11,15 +11,22 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import CalibrationConfig
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, rotation_from_vector
+from pipeprog_sfm.sparse.bundle_adjustment import (
+    CAUCHY,
+    eliminate_points,
+    factorised,
+    hold_scale,
+    moves_of_points,
+    pairs_of_views,
+    rotation_from_vector,
+)
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map
@@ -72,10 +79,11 @@ class _State:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Residuals (2K,), weighted, and their derivatives by poses and camera (2K, 6V + 3) and by points (K, 2, 3)."""
+    """Residuals (K, 2), weighted, and their derivatives by pose (K, 2, 6), camera (K, 2, 3) and point (K, 2, 3)."""
 
     residuals: FloatArray
-    by_views: scipy.sparse.csr_matrix
+    by_pose: FloatArray
+    by_number: FloatArray
     by_point: FloatArray
 
 
@@ -121,15 +129,50 @@ class _Problem:
         by_shift = by_ray @ slope * (root / np.maximum(depth, 1e-9))[:, None, None]
         by_turn = np.cross(turned[:, None, :], by_shift)
         by_point = by_shift @ state.rotation[self.view]
-        last = np.broadcast_to(6 * len(state.rotation) + np.arange(3), (len(rays), 3))
-        columns = np.c_[6 * self.view[:, None] + np.arange(6), last]
-        data = np.concatenate([by_turn, by_shift, by_number * root[:, None, None]], axis=-1)
-        rows = np.arange(2 * len(rays)).reshape(-1, 2, 1)
-        by_views = scipy.sparse.csr_matrix(
-            (data.ravel(), (np.broadcast_to(rows, data.shape).ravel(), np.repeat(columns, 2, axis=0).ravel())),
-            shape=(2 * len(rays), 6 * len(state.rotation) + 3),
+        by_pose = np.concatenate([by_turn, by_shift], axis=-1)
+        return _Rows(error * self.noise * root[:, None], by_pose, by_number * root[:, None, None], by_point)
+
+
+class _Reduced:
+    """Normal equations without the points: those of the poses, factorised, with the camera's numbers as a border.
+
+    The first view stays, and so does the scale.
+    """
+
+    def __init__(self, problem: _Problem, state: _State, rows: _Rows, damping: float) -> None:
+        self.problem, self.index = problem, np.arange(len(state.rotation)) - 1
+        count = len(state.rotation) - 1
+        u, gradient, v, self.by_points, w, own, self.pull, border, coupling = _normal_equations(
+            rows.by_pose, rows.by_number, rows.by_point, rows.residuals, problem.start, problem.view, count
         )
-        return _Rows((error * self.noise * root[:, None]).ravel(), by_views, by_point)
+        pairs, row, column = pairs_of_views(problem.start, problem.view, self.index, count)
+        blocks, self.gradient, self.inverse = eliminate_points(
+            u, gradient, v, self.by_points, w, problem.start, problem.view, self.index, pairs, len(row), damping
+        )
+        hold_scale(blocks, pairs, self.index, state.rotation, state.translation)
+        self.poses = factorised(blocks, row, column, count)
+        self.by_pose, self.coupling = w, coupling
+        lifted = self.inverse @ coupling.transpose(0, 2, 1)  # (P, 3, 3), by point and number
+        free = problem.view > 0
+        np.subtract.at(border, problem.view[free] - 1, (w @ lifted[problem.owner])[free])
+        self.border = border.reshape(-1, 3)
+        self.solved = self.poses.solve(self.border)
+        own[range(3), range(3)] += damping * np.diag(own) + 1e-9 + 1.0 / problem.prior**2
+        own -= np.einsum("pij,pjk->ik", coupling, lifted)
+        self.corner = np.linalg.inv(own - self.border.T @ self.solved)
+        self.pull -= np.einsum("pji,pj->i", lifted, self.by_points)
+
+    def step(self, prior: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Steps of the poses (V - 1, 6), the numbers (3,) and the points (P, 3); prior (3,): its gradient."""
+        numbers = self.corner @ (self.pull + prior - self.solved.T @ self.gradient.ravel())
+        poses = self.poses.solve(self.gradient.ravel()) - self.solved @ numbers
+        return poses.reshape(-1, 6), numbers, self.moves(self.by_points, poses, numbers)
+
+    def moves(self, by_points: FloatArray, poses: FloatArray, numbers: FloatArray) -> FloatArray:
+        """(P, 3) moves of the points that go with those of the poses (6 (V - 1),) and the numbers (3,)."""
+        rest = by_points - np.einsum("pji,j->pi", self.coupling, numbers)
+        start, view = self.problem.start, self.problem.view
+        return moves_of_points(poses.reshape(-1, 6), rest, self.by_pose, self.inverse, start, view, self.index)
 
 
 def refine(
@@ -236,11 +279,11 @@ def _adjusted(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[
     cost, damping = problem.cost(state, told), 1e-4
     for _ in range(MAX_ITERATIONS):
         rows = problem.linearised(state)
-        sigmas = _sigmas(problem, rows)
+        sigmas = _sigmas(problem, state, rows)
         before = state.numbers
         while damping < 1e3:
-            step, moves = _step(problem, rows, (told - state.numbers) / problem.prior**2, damping)
-            trial = _moved(state, step, moves)
+            step = _Reduced(problem, state, rows, damping).step((told - state.numbers) / problem.prior**2)
+            trial = _moved(state, *step)
             new_cost = problem.cost(trial, told)
             if new_cost < cost:
                 state, cost, damping = trial, new_cost, max(damping * 0.1, 1e-9)
@@ -250,74 +293,70 @@ def _adjusted(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[
             break
         if (np.abs(state.numbers - before) <= CONVERGED * sigmas).all():
             break
-    return state, _sigmas(problem, problem.linearised(state))
+    return state, _sigmas(problem, state, problem.linearised(state))
 
 
-def _moved(state: _State, step: FloatArray, moves: FloatArray) -> _State:
-    pose = step[:-3].reshape(-1, 6)
-    return _State(
-        rotation_from_vector(pose[:, :3]) @ state.rotation,
-        state.translation + pose[:, 3:],
-        state.points + moves,
-        state.numbers + step[-3:],
-    )
+def _moved(state: _State, poses: FloatArray, numbers: FloatArray, moves: FloatArray) -> _State:
+    rotation, translation = state.rotation.copy(), state.translation.copy()
+    rotation[1:] = rotation_from_vector(poses[:, :3]) @ rotation[1:]
+    translation[1:] += poses[:, 3:]
+    return _State(rotation, translation, state.points + moves, state.numbers + numbers)
 
 
-def _eliminated(
-    problem: _Problem, rows: _Rows, damping: float
-) -> tuple[scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, FloatArray, scipy.sparse.csr_matrix]:
-    """Normal matrix of views and camera without the points, its coupling (6V + 3, 3P), inverses (P, 3, 3), and both."""
-    first, count = problem.start[:-1], len(problem.ids)
-    own = np.add.reduceat(rows.by_point.transpose(0, 2, 1) @ rows.by_point, first, axis=0)
-    own[:, range(3), range(3)] *= 1 + damping
-    own[:, range(3), range(3)] += 1e-12
-    inverse = np.linalg.inv(own)
-    columns = 3 * problem.owner[:, None, None] + np.arange(3)
-    row = np.arange(2 * len(problem.view)).reshape(-1, 2, 1)
-    shape = rows.by_point.shape
-    by_points = scipy.sparse.csr_matrix(
-        (rows.by_point.ravel(), (np.broadcast_to(row, shape).ravel(), np.broadcast_to(columns, shape).ravel())),
-        shape=(2 * len(problem.view), 3 * count),
-    )
-    coupling = (rows.by_views.T @ by_points).tocsr()
-    blocks = scipy.sparse.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
-    lifted = (coupling @ blocks).tocsr()
-    normal = (rows.by_views.T @ rows.by_views).tocsc()
-    diagonal = normal.diagonal() * damping + 1e-9
-    diagonal[:6] += 1e12  # the first view holds the model's place
-    diagonal[-3:] += 1.0 / problem.prior**2
-    return (normal + scipy.sparse.diags(diagonal) - lifted @ coupling.T).tocsc(), coupling, inverse, lifted
-
-
-def _step(problem: _Problem, rows: _Rows, pull: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Step (6V + 3,) of poses and camera and (P, 3) of the points; pull (3,): the prior's gradient."""
-    reduced, coupling, inverse, lifted = _eliminated(problem, rows, damping)
-    gradient = -(rows.by_views.T @ rows.residuals)
-    gradient[-3:] += pull
-    along = np.einsum("kji,kj->ki", rows.by_point, rows.residuals.reshape(-1, 2))
-    points = -np.add.reduceat(along, problem.start[:-1], axis=0)
-    step = scipy.sparse.linalg.splu(reduced).solve(gradient - lifted @ points.ravel())
-    moves = np.einsum("pij,pj->pi", inverse, points - (coupling.T @ step).reshape(-1, 3))
-    return step, moves
-
-
-def _sigmas(problem: _Problem, rows: _Rows) -> FloatArray:
+def _sigmas(problem: _Problem, state: _State, rows: _Rows) -> FloatArray:
     """(3,) standard deviations of the numbers: errors of points independent (sandwich covariance), with the prior.
 
     As `function_covariance` of the bundle adjustment.
     """
-    reduced, coupling, inverse, _ = _eliminated(problem, rows, 0.0)
-    size = reduced.shape[0]
-    unit = np.zeros((size, 3))
-    unit[-3:] = np.eye(3)
-    answer = scipy.sparse.linalg.splu(reduced + 1e-9 * scipy.sparse.identity(size, format="csc")).solve(unit)
-    moves = -np.einsum("pij,pjn->pin", inverse, (coupling.T @ answer).reshape(-1, 3, 3))
-    lines = (rows.by_views @ answer).reshape(-1, 2, 3) + rows.by_point @ moves[problem.owner]
-    scores = np.add.reduceat(np.einsum("kin,ki->kn", lines, rows.residuals.reshape(-1, 2)), problem.start[:-1], axis=0)
-    observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + size - 6
+    reduced = _Reduced(problem, state, rows, 0.0)
+    poses = -reduced.solved @ reduced.corner
+    none = np.zeros((len(problem.ids), 3))
+    moves = np.stack([reduced.moves(none, *each) for each in zip(poses.T, reduced.corner, strict=True)], axis=-1)
+    turned = np.concatenate([np.zeros((1, 6, 3)), poses.reshape(-1, 6, 3)])  # the first view stays
+    lines = rows.by_pose @ turned[problem.view] + rows.by_number @ reduced.corner + rows.by_point @ moves[problem.owner]
+    scores = np.add.reduceat(np.einsum("kin,ki->kn", lines, rows.residuals), problem.start[:-1], axis=0)
+    observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + 6 * len(state.rotation) + 3 - 6
     spread = np.diag(scores.T @ scores) * observed / max(observed - unknown, 1)
-    by_prior = (answer[-3:] / problem.prior[:, None]) ** 2
+    by_prior = (reduced.corner / problem.prior[:, None]) ** 2
     return np.sqrt(spread + by_prior.sum(axis=0))
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(by_pose, by_number, by_point, residuals, start, view, count):  # type: ignore[no-untyped-def]  # compiled
+    """Blocks of the normal equations, and the descent gradients, of poses, points and camera, and what couples them.
+
+    In the order of `eliminate_points`: poses (count, 6, 6), (count, 6), points (P, 3, 3), (P, 3), pose with point
+    (K, 6, 3); then camera (3, 3), (3,), pose with camera (count, 6, 3), camera with point (P, 3, 3).
+    """
+    points = len(start) - 1
+    u, gu = np.zeros((count, 6, 6)), np.zeros((count, 6))
+    v, gv = np.zeros((points, 3, 3)), np.zeros((points, 3))
+    w = np.zeros((len(view), 6, 3))
+    c, gc = np.zeros((3, 3)), np.zeros(3)
+    uc, cv = np.zeros((count, 6, 3)), np.zeros((points, 3, 3))
+    for p in range(points):
+        for k in range(start[p], start[p + 1]):
+            n = view[k] - 1
+            for r in range(2):
+                error = residuals[k, r]
+                pose, number, point = by_pose[k, r], by_number[k, r], by_point[k, r]
+                for i in range(3):
+                    gv[p, i] -= point[i] * error
+                    gc[i] -= number[i] * error
+                    for j in range(3):
+                        v[p, i, j] += point[i] * point[j]
+                        c[i, j] += number[i] * number[j]
+                        cv[p, i, j] += number[i] * point[j]
+                if n < 0:
+                    continue
+                for i in range(6):
+                    gu[n, i] -= pose[i] * error
+                    for j in range(6):
+                        u[n, i, j] += pose[i] * pose[j]
+                    for j in range(3):
+                        w[k, i, j] += pose[i] * point[j]
+                        uc[n, i, j] += pose[i] * number[j]
+    return u, gu, v, gv, w, c, gc, uc, cv
 
 
 def _derivatives(function: Callable[[FloatArray], FloatArray], count: int) -> FloatArray:
