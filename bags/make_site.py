@@ -92,7 +92,7 @@ def make_site(
 ) -> None:
     """Build a site from a seed, walk a camera through it, and write what it sees and what is true."""
     console = Console(stderr=True)
-    lens = _lens(size, distortion)
+    lens = lens_of(size, distortion)
     rng = np.random.default_rng(seed)
     build = build_lab if layout == Layout.lab else build_field
     try:
@@ -115,7 +115,7 @@ def make_site(
     stem = out.with_suffix("")
     write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, [c.share for c in seen]))
     write_boq(Path(f"{stem}.boq.yaml"), site)
-    write_boards(Path(f"{stem}.board.yaml"), site)
+    write_boards(Path(f"{stem}.board.yaml"), len(site.boards))
     if surface:
         points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
         np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
@@ -156,13 +156,14 @@ def _frames(shot: Shot, times: NDArray[np.float64], seed: int, jobs: int) -> Ite
             yield from pool.map(make, range(first, min(first + jobs, len(times))))
 
 
-def _lens(size: Size, distortion: str) -> Lens:
+def lens_of(size: Size, distortion: str, focal_over_width: float = _FOCAL_OVER_WIDTH) -> Lens:
+    """The lens that options describe."""
     try:
         k1, k2, p1, p2, k3 = (float(value) for value in distortion.split(","))
     except ValueError:
         raise typer.BadParameter(f"'{distortion}': give five numbers, k1,k2,p1,p2,k3") from None
     width, height = _SIZES[size.value]
-    focal = _FOCAL_OVER_WIDTH * width
+    focal = focal_over_width * width
     return Lens(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, (k1, k2, p1, p2, k3))
 
 

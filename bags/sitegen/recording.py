@@ -163,11 +163,11 @@ def write_boq(path: Path, site: Site) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_boards(path: Path, site: Site) -> None:
-    """Write the boards' circle centres, in each board's own frame."""
+def write_boards(path: Path, count: int) -> None:
+    """Write the circle centres of `count` boards, in each board's own frame."""
     centres = ", ".join(f"[{x * 1e3:g}, {y * 1e3:g}]" for x, y in BOARD_CENTRES)
     lines = ["boards:"]
-    for name in "ABCDEFGH"[: len(site.boards)]:
+    for name in "ABCDEFGH"[:count]:
         lines += [
             f"  - name: {name}",
             f"    circle_radius_mm: {BOARD_CIRCLE_RADIUS * 1e3:g}",

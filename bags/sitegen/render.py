@@ -111,6 +111,22 @@ def _direction(u: float, v: float, lens: FloatArray) -> tuple[float, float, floa
 
 
 @njit(nogil=True)
+def _directions(lens: FloatArray, offsets: FloatArray, found: FloatArray) -> None:
+    for k in range(len(offsets)):
+        for r in range(found.shape[1]):
+            for c in range(found.shape[2]):
+                x, y, z = _direction(c + offsets[k, 0], r + offsets[k, 1], lens)
+                found[k, r, c, 0], found[k, r, c, 1] = x / z, y / z
+
+
+def pixel_directions(lens: Lens, offsets: FloatArray) -> FloatArray:
+    """(K, H, W, 2) directions (x, y at z = 1, optical frame) of rays that pass each pixel at (K, 2) offsets, px."""
+    found = np.empty((len(offsets), lens.height, lens.width, 2))
+    _directions(lens.row(), offsets, found)
+    return found
+
+
+@njit(nogil=True)
 def _cast(
     tree: PackedTree, pose: FloatArray, lens: FloatArray, u: float, v: float, stack: IntArray
 ) -> tuple[int, Hit, float, float, float]:

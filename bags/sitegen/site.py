@@ -29,7 +29,7 @@ FIELD_RADII = tuple(CLASSES)
 
 BOARD_CIRCLE_RADIUS = 0.040
 BOARD_CENTRES = ((-0.240, 0.150), (0.240, 0.150), (0.0, 0.0), (-0.240, -0.150), (0.240, -0.150))
-_BOARD_HALF = (0.300, 0.210)
+BOARD_HALF = (0.300, 0.210)
 _BOARD_THICKNESS = 0.012
 _PAINT_THICKNESS = 2e-5  # the circles lie this far before the board, so that rays meet them first
 BEND = 2.2  # bend radius over pipe radius, as sold for steel elbows of tight bend
@@ -162,9 +162,7 @@ class Site:
         right, up = rotation[0], rotation[1]
         back = np.asarray(centre, float)
         middle = back + n * _BOARD_THICKNESS / 2
-        self.add(
-            Primitive(shapes.Kind.BOX, middle, rotation, (*_BOARD_HALF, _BOARD_THICKNESS / 2), self.dressed(BLACK))
-        )
+        self.add(Primitive(shapes.Kind.BOX, middle, rotation, (*BOARD_HALF, _BOARD_THICKNESS / 2), self.dressed(BLACK)))
         face = back + n * (_BOARD_THICKNESS + _PAINT_THICKNESS)
         printed = np.array(BOARD_CENTRES) + self.board_error * printing.standard_normal((len(BOARD_CENTRES), 2))
         circles = np.array([face + x * right + y * up for x, y in printed])

@@ -52,7 +52,14 @@ GLUE = {
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
 # and all may import config.py and types.py.
 FOLDERS = {
-    "pipeprog_sfm": {"features": set(), "sparse": {"features"}, "boards": set(), "metric": {"boards"}, "dense": set()},
+    "pipeprog_sfm": {
+        "features": set(),
+        "sparse": {"features"},
+        "boards": set(),
+        "metric": {"boards"},
+        "dense": set(),
+        "calibration": {"boards"},
+    },
     "pipeprog_detect": {
         "cloud": set(),
         "silhouette": {"cloud"},
@@ -76,6 +83,7 @@ FOLDERS = {
         "commands": {  # as thin as they are, they stand above all
             *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
             *("console", "footage", "plane_from_keyframe", "recording", "recording_check", "comparison", "patrol"),
+            "calibrate",
         },
         "survey": {"playback", "recording", "results"},
         "patrol": {"results"},

@@ -15,6 +15,7 @@ import click
 import typer
 
 from pipeprog_bringup.commands.board import board
+from pipeprog_bringup.commands.calibrate import calibrate
 from pipeprog_bringup.commands.check import check
 from pipeprog_bringup.commands.compare import compare
 from pipeprog_bringup.commands.detect import detect
@@ -40,7 +41,7 @@ app = typer.Typer(
 for panel, commands in {
     "From recordings": (check, replay, fleet, detect),
     "On a robot": (patrol,),
-    "To recordings": (ingest, board),
+    "To recordings": (ingest, board, calibrate),
     "From results": (score, report, compare, view, export),
 }.items():
     for command in commands:

@@ -127,12 +127,12 @@ def _samples(bag: Bag, limit: float) -> tuple[list[NDArray[np.uint8]], list[int]
         if frame.fault:
             continue
         stamps.append(frame.stamp)
-        if number % step == 0 and (image := _gray(frame, bag.image_type)) is not None:
+        if number % step == 0 and (image := gray_image(frame, bag.image_type)) is not None:
             images.append(image)
     return images, stamps, unusable
 
 
-def _gray(frame: ImageMessage, type_name: str) -> NDArray[np.uint8] | None:
+def gray_image(frame: ImageMessage, type_name: str) -> NDArray[np.uint8] | None:
     """(H, W) gray image; None where it cannot be decoded or has more than 8 bits a channel."""
     fields = cdr.read_image(frame.data, type_name)
     pixels = np.frombuffer(fields.data, np.uint8)

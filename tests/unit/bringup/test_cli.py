@@ -44,7 +44,7 @@ def folder(tmp_path: Path) -> Path:
 def test_help_names_every_command() -> None:
     result = pipeprog("--help")
     assert result.returncode == 0
-    for command in ("replay", "detect", "ingest", "board", "score", "report", "fleet"):
+    for command in ("replay", "detect", "ingest", "board", "calibrate", "score", "report", "fleet"):
         assert command in result.stdout
 
 

@@ -28,7 +28,7 @@ def ingest(
         Path | None,
         typer.Option(
             "--camera",
-            help="Calibration of a video, as ROS camera_calibration writes it. Example: `--camera phone.yaml`",
+            help="Calibration of a video, as `pipeprog calibrate` writes it. Example: `--camera phone.yaml`",
             metavar="CAMERA.yaml",
         ),
     ] = None,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,25 @@ def read_camera_file(path: Path) -> CameraFile:
         return CameraFile(Camera.from_calibration(width, height, matrix, model, distortion), readout)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def camera_file_text(camera: Camera, readout: float | None, comments: Sequence[str]) -> str:
+    """What `read_camera_file` reads, with lines for people at its beginning."""
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    lines = [f"# {comment}" for comment in comments]
+    lines += [f"image_width: {camera.width}", f"image_height: {camera.height}", "camera_name: camera"]
+    lines += _matrix("camera_matrix", 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+    lines += [f"distortion_model: {camera.distortion_model}"]
+    lines += _matrix("distortion_coefficients", 1, camera.distortion)
+    lines += _matrix("rectification_matrix", 3, np.eye(3).ravel().tolist())
+    lines += _matrix("projection_matrix", 3, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+    lines += [] if readout is None else [f"readout: {readout!r}  # s, from the first row of an image to the last"]
+    return "\n".join(lines) + "\n"
+
+
+def _matrix(name: str, rows: int, data: Sequence[float]) -> list[str]:
+    numbers = ", ".join(repr(float(value)) for value in data)
+    return [f"{name}:", f"  rows: {rows}", f"  cols: {len(data) // rows}", f"  data: [{numbers}]"]
 
 
 def _numbers(content: dict[str, Any], key: str) -> list[float]:

@@ -27,7 +27,7 @@ def guessed_camera(video: Path) -> Camera:
     if length is None:
         raise InputError(
             f"{video} does not tell its focal length: a video needs the calibration of its camera: give --camera "
-            "CAMERA.yaml (calibrate in the video's own mode with ROS's camera_calibration, see docs/calibration.md)"
+            "CAMERA.yaml (calibrate in the video's own mode with `pipeprog calibrate`, see docs/calibration.md)"
         )
     focal = length / FILM_DIAGONAL * float(np.hypot(width, height))
     matrix = [focal, 0, (width - 1) / 2, 0, focal, (height - 1) / 2, 0, 0, 1]

@@ -40,6 +40,12 @@ class Video:
         self._start = UNDATED if movie.created is None else movie.created
         self.notes += _colour_notes(path, movie)
 
+    @property
+    def seconds(self) -> float:
+        """How long it lasts, as its container says; 0: it does not say."""
+        rate = _property(self._capture, cv2.CAP_PROP_FPS)
+        return self.expected / rate if rate > 0 and self.expected > 0 else 0.0
+
     def shots(self, excerpt: Excerpt) -> Iterator[Shot]:
         """The pictures; where the container has no time of a day for one, its rate stands in."""
         self._take_jpeg_as_it_is()
