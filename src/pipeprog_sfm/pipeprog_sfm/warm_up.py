@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board_file import BoardFile
+from pipeprog_sfm.camera_in_use import FIRST_CHECK
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.dense.depth_fusion import Fusion
 from pipeprog_sfm.dense.stereo import StereoImage, depth_map
@@ -19,14 +20,14 @@ STEP = 24  # px between two views of a wall at 1 m
 
 
 def warm_up(config: SfmConfig) -> None:
-    """Runs each stage on five views of a plane; takes about a second once everything is compiled."""
+    """Runs each stage on a few views of a plane; takes about a second once everything is compiled."""
     width, height = SIZE
     camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2)
     wall = np.random.default_rng(0).integers(0, 256, (height // 4, width), np.uint8)
     wall = cv2.resize(wall, (4 * width, height), interpolation=cv2.INTER_CUBIC)
     reconstruction = Reconstruction(config, BoardFile())
     views = []
-    for number in range(5):
+    for number in range(FIRST_CHECK):  # with the last one, the calibration is looked at
         gray = np.ascontiguousarray(wall[:, number * STEP :][:, :width])
         image = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
         pose = np.eye(4)
