@@ -238,3 +238,10 @@ def test_every_python_file_names_its_licence() -> None:
     files = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py")) if "build" not in path.parts]
     lacking = [str(path.relative_to(ROOT)) for path in files if LICENCE not in path.read_text().splitlines()[:2]]
     assert not lacking, f"begin them with `{LICENCE}`"
+
+
+def test_what_takes_long_to_import_is_imported_where_it_is_used() -> None:
+    """A replay has six processes, and most of them need none of these; a report draws in any case."""
+    slow = re.compile(r"^(import|from) (scipy\.stats|sklearn|matplotlib)\b", re.MULTILINE)
+    importing = {path for path in MODULES if slow.search(path.read_text())}
+    assert {str(path) for path in importing if path.parent.name != "report"} == set()

@@ -7,7 +7,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.stats import qmc
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
@@ -115,6 +114,8 @@ def _annealed(
     Points of Sobol's sequence all over the range, and the `seeds` (S, 5), are scored against widely smeared edges; the
     best spread again and again, less from round to round, over edges that are smeared less (annealing).
     """
+    from scipy.stats import qmc  # here, since its import takes half a second, in processes that never search, too
+
     random = np.random.default_rng(0)
     gain = float(np.median(samples.gain))
     half_width = float(np.median(samples.half_width))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.board_covariance import cauchy_weights
@@ -71,7 +71,7 @@ def contradiction(place: PlacedBoard, residuals: CircleResiduals, tolerance: flo
     variance = residuals.sigmas**2 + tolerance**2
     distance = (residuals.offsets**2 / variance).sum(1)
     known = ~np.isnan(distance)
-    if not (distance[known] > chi2.ppf(1 - FALSE_ALARM, 3)).any():
+    if not (distance[known] > chdtri(3, FALSE_ALARM)).any():
         return ""
     offsets = 1000 * np.linalg.norm(residuals.offsets, axis=1)
     listed = ", ".join(f"{number + 1}: {offset:.2f} mm" for number, offset in enumerate(offsets) if known[number])
