@@ -20,6 +20,7 @@ from rich.progress import track
 
 from sitegen.field import build_field
 from sitegen.lab import build_lab
+from sitegen.night import second_night
 from sitegen.recording import (
     FIRST_STAMP,
     camera_info,
@@ -41,6 +42,7 @@ _SIZES = {"480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "4k": 
 _PREVIEW_WIDTH = 320  # px; the thinnest pipe is then 2 px wide at 2 m
 _LAB_SECONDS = 16.0
 _MOTION_SEED = 1 << 20  # beyond the numbers of frames, which are their seeds
+_NIGHT_SEED = 1 << 21  # another than those of frames and motion
 _SURFACE_VIEWS = 20  # images that contribute true surface points: a million points
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -74,6 +76,9 @@ def make_site(
     distance: Annotated[float, typer.Option(help="from the wall, m", min=0.5, max=4.0)] = 2.0,
     wobble: Annotated[float, typer.Option(help="unsteadiness of the hand: 0 a rail, 1 a careful person", min=0)] = 1.0,
     richness: Annotated[float, typer.Option(help="texture: 1 rich, 0.2 freshly painted, 0 none", min=0, max=2)] = 1.0,
+    second_night_later: Annotated[
+        bool, typer.Option("--second-night", help="a pipe more, one less, one longer, other light, no board")
+    ] = False,
     tiled: Annotated[float, typer.Option(help="metres after which the walls' texture repeats, 0 never", min=0)] = 0.0,
     exposure_ms: Annotated[float, typer.Option(help="exposure time: motion blur", min=0)] = 0.0,
     readout_ms: Annotated[float, typer.Option(help="rolling shutter, first to last row", min=0)] = 0.0,
@@ -97,6 +102,9 @@ def make_site(
     build = build_lab if layout == Layout.lab else build_field
     try:
         site = build(rng, richness, tiled, distance, board_error_mm / 1e3)
+        if second_night_later:
+            rng = np.random.default_rng([seed, _NIGHT_SEED])
+            second_night(site, rng)
     except RuntimeError as error:
         console.print(f"error: {error}")
         raise typer.Exit(1) from None
@@ -115,13 +123,14 @@ def make_site(
     stem = out.with_suffix("")
     write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, [c.share for c in seen]))
     write_boq(Path(f"{stem}.boq.yaml"), site)
-    write_boards(Path(f"{stem}.board.yaml"), len(site.boards))
+    if site.boards:
+        write_boards(Path(f"{stem}.board.yaml"), len(site.boards))
     if surface:
         points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
         np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
     # The recording is written last: where it exists, all files that belong to it exist, too.
     sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain)
-    frames = _frames(Shot(scene, lens, walk, sensor), times, seed, jobs)
+    frames = _frames(Shot(scene, lens, walk, sensor), times, seed + _NIGHT_SEED * second_night_later, jobs)
     motion_rng = np.random.default_rng([seed, _MOTION_SEED])
     motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng)
     shown = track(frames, total=len(times), description=out.name, console=console)

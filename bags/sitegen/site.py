@@ -88,6 +88,7 @@ class Site:
     board_error: float = 0.0  # m, standard deviation of a printed circle's place, along and across
     primitives: list[Primitive] = field(default_factory=list)
     pipes: list[Pipe] = field(default_factory=list)
+    removed: list[Pipe] = field(default_factory=list)  # of an earlier night, and planned as they were
     ignored: list[tuple[FloatArray, FloatArray, float]] = field(default_factory=list)
     boards: list[FloatArray] = field(default_factory=list)
     lamps: list[Lamp] = field(default_factory=list)
@@ -179,7 +180,7 @@ class Site:
     def planned_lengths(self) -> dict[float, float]:
         """Radius -> planned metres: a quarter more than is installed, to the decimetre."""
         return {
-            radius: round(1.25 * sum(p.length for p in self.pipes if p.radius == radius), 1)
+            radius: round(1.25 * sum(p.length for p in [*self.pipes, *self.removed] if p.radius == radius), 1)
             for radius in self.planned_radii
         }
 
