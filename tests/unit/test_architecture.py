@@ -59,6 +59,7 @@ FOLDERS = {
         "metric": {"boards"},
         "dense": set(),
         "calibration": {"boards"},
+        "alignment": {"features", "sparse", "boards"},
     },
     "pipeprog_detect": {
         "cloud": set(),

@@ -72,6 +72,11 @@ MAX_PIPES = 10_000  # of one survey; a storey of a hospital has some hundreds
 MAX_SCORED = 2000  # pipes of a result or truth that is scored: each is compared with each
 MAX_TARGET_LENGTH = 1e5  # m; a board's circles, and distances between boards on one site
 
+# Maps of earlier surveys (map.npz).
+MAX_MAP_ARRAY = 1 << 30  # bytes of one array; MAX_MAP_FEATURES descriptors of 128
+MAX_MAP_FEATURES = 1 << 23  # features, 600 of each keyframe: 14 000 keyframes, two hours at two a second
+MAX_MAP_CLOUD = 1 << 24  # points, one for each cell of 2 cm: 6700 m2 of surfaces
+
 # Files of text.
 MAX_YAML = 1 << 20  # bytes; bills and boards have kilobytes, and libyaml reads a megabyte in under 2 s
 MAX_METADATA = 1 << 22  # bytes of a rosbag2 metadata.yaml; 10 000 files of a split recording take 1.5 MB

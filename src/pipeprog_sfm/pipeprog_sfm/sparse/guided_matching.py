@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray, match_guided
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -29,23 +30,18 @@ def link(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> No
 
     keyframes: at least those of the model's views, by stamp.
     """
-    seen = model.seen(view)
-    depth = model.points[seen] @ model.rotation[view, 2] + model.translation[view, 2]
-    depth = depth[depth > 0]
-    if not len(depth):
-        return
-    near, far = np.percentile(depth, DEPTH_PERCENTILES)
-    depth_range = float(near / DEPTH_MARGIN), float(DEPTH_MARGIN * far)
-    features, others = [], []
-    for other in partners(model, view, keyframes):
-        found = _match_guided(model, view, other, keyframes, depth_range)
-        features.append(found[:, 0] + model.offsets[view])
-        others.append(found[:, 1] + model.offsets[other])
-    if not features:
-        return
-    feature, other_feature = np.concatenate(features).astype(np.int64), np.concatenate(others).astype(np.int64)
-    order = np.lexsort((other_feature, feature))
-    model.link(feature[order], other_feature[order])
+    _link_with(model, view, keyframes, partners)
+
+
+def link_among(model: SparseModel, view: int, others: IntArray, keyframes: Mapping[int, Keyframe]) -> None:
+    """As `link`, with those of the `others` (views) alone that look at the same place."""
+
+    def among(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> list[int]:
+        score = np.zeros(len(model))
+        score[others] = _overlaps(model, view, keyframes)[others]
+        return _best(score)
+
+    _link_with(model, view, keyframes, among)
 
 
 def partners(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> list[int]:
@@ -56,6 +52,38 @@ def partners(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -
     gap = np.abs(np.array(model.stamps) - model.stamps[view])
     gap[view] = np.iinfo(np.int64).max
     temporal = [int(other) for other in np.argsort(gap, kind="stable")[:TEMPORAL] if other != view]
+    score = _overlaps(model, view, keyframes)
+    score[[view, *temporal]] = 0.0
+    return temporal + _best(score)
+
+
+def _link_with(
+    model: SparseModel,
+    view: int,
+    keyframes: Mapping[int, Keyframe],
+    choose: Callable[[SparseModel, int, Mapping[int, Keyframe]], list[int]],
+) -> None:
+    seen = model.seen(view)
+    depth = model.points[seen] @ model.rotation[view, 2] + model.translation[view, 2]
+    depth = depth[depth > 0]
+    if not len(depth):
+        return
+    near, far = np.percentile(depth, DEPTH_PERCENTILES)
+    depth_range = float(near / DEPTH_MARGIN), float(DEPTH_MARGIN * far)
+    features, others = [], []
+    for other in choose(model, view, keyframes):
+        found = _match_guided(model, view, other, keyframes, depth_range)
+        features.append(found[:, 0] + model.offsets[view])
+        others.append(found[:, 1] + model.offsets[other])
+    if not features:
+        return
+    feature, other_feature = np.concatenate(features).astype(np.int64), np.concatenate(others).astype(np.int64)
+    order = np.lexsort((other_feature, feature))
+    model.link(feature[order], other_feature[order])
+
+
+def _overlaps(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> FloatArray:
+    """(V,) share of the view's points that each view sees from a similar direction and distance."""
     seen = model.seen(view)
     sample = model.points[seen[:: max(len(seen) // SAMPLE, 1)]]
     # One matrix product, coordinate by coordinate: the only step whose cost grows with the number of views.
@@ -69,10 +97,12 @@ def partners(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -
     own = depth[view]
     visible &= (depth < MAX_SCALE * own) & (MAX_SCALE * depth > own)
     similar = model.rotation[:, 2] @ model.rotation[view, 2] > np.cos(MAX_ANGLE)
-    score = np.where(similar, visible.mean(axis=1), 0.0)
-    score[[view, *temporal]] = 0.0
+    return np.where(similar, visible.mean(axis=1), 0.0)
+
+
+def _best(score: FloatArray) -> list[int]:
     best = np.argsort(-score, kind="stable")[:COVISIBLE]
-    return temporal + [int(other) for other in best if score[other] > MIN_OVERLAP]
+    return [int(other) for other in best if score[other] > MIN_OVERLAP]
 
 
 def _match_guided(
