@@ -140,7 +140,8 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
         assert (one / name).read_bytes() == (two / name).read_bytes(), name
 
     assert sorted(file.name for file in one.iterdir()) == [
-        *("cloud.las", "cloud.ply", "colmap", "config.yaml", "frames.csv", "out.mcap", "pipes.json", "progress.csv"),
+        *("cloud.las", "cloud.ply", "colmap", "config.yaml", "frames.csv", "map.npz", "out.mcap", "pipes.json"),
+        "progress.csv",
         "run.json",
         "trajectory.tum",
     ]

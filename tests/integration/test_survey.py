@@ -40,7 +40,7 @@ MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect
     "survey": "pipeprog_bringup.survey.node"
 }
 REPLAYED = {"cloud.las", "cloud.ply", "config.yaml", "frames.csv", "out.mcap", "pipes.json", "progress.csv", "run.json"}
-REPLAYED |= {"trajectory.tum", "colmap/cameras.txt", "colmap/images.txt", "colmap/points3D.txt"}
+REPLAYED |= {"map.npz", "trajectory.tum", "colmap/cameras.txt", "colmap/images.txt", "colmap/points3D.txt"}
 
 
 class Mission:

@@ -17,7 +17,7 @@ from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph
 from pipeprog_bringup.playback.private_network import private_network
 from pipeprog_bringup.playback.scratch import check_room, scratch_folder
 from pipeprog_bringup.playback.session import Session, State
-from pipeprog_bringup.playback.survey_writer import coverage_of, record_keyframes, record_survey, write_survey
+from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, seen_by, write_survey
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.recording_check import faults_of
@@ -30,6 +30,8 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.product import Product
 from pipeprog_node.messages import points_from_cloud
+from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
+from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
 FOCAL_SIGMA = "sfm.calibration.focal_sigma"
@@ -52,6 +54,7 @@ class Request:
     odometry_topic: str | None = None
     imu_topic: str | None = None
     with_cloud: bool = True
+    reference: Path | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +77,7 @@ class _Inputs:
     boq: BillOfQuantities
     board_file: BoardFile
     configs: dict[str, Any]  # settings of each node
+    reference: SurveyMap | None = None
 
 
 def replay(request: Request, report: Callable[[State], None], modules: dict[str, str] = NODE_MODULES) -> Outcome:
@@ -96,8 +100,8 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
             record_survey(recording, survey, status)
             cameras = record_keyframes(recording, inputs.bag, session.log, survey)
         started = time.monotonic()
-        coverage = coverage_of(survey, cameras, inputs.boq.pipes)
-        product = write_survey(folder, survey, session.log, coverage, request.with_cloud)
+        seen = seen_by(survey, cameras, inputs.boq.pipes)
+        product = write_survey(folder, survey, session.log, seen, request.with_cloud, inputs.reference)
         points = points_from_cloud(survey.cloud)[0]
         outcome = Outcome(
             product=product,
@@ -132,7 +136,7 @@ def _read(request: Request) -> _Inputs:
         raise InputError("--set frames.lockstep: a replay is always in lockstep, or it would lose frames")
     configs = effective([*_told_by(bag, _names(request)), *request.overrides])
     configs["frames"] = dataclasses.replace(configs["frames"], lockstep=True)
-    return _Inputs(bag, boq, board_file, configs)
+    return _Inputs(bag, boq, board_file, configs, read_map(request.reference / MAP_FILE) if request.reference else None)
 
 
 def _told_by(bag: Bag, given: set[str]) -> list[str]:
@@ -154,7 +158,9 @@ def _parameters(request: Request, configs: dict[str, Any], colmap: Path) -> dict
     """The ROS parameters of each node: its settings, and the files that it reads or writes."""
     parameters = as_parameters(configs)
     board = str(request.board.resolve()) if request.board else ""
+    reference = str((request.reference / MAP_FILE).resolve()) if request.reference else ""
     parameters["sfm"] |= {"lockstep": True, "board": board, "colmap": str(colmap.resolve()), "intermediate": False}
+    parameters["sfm"]["reference"] = reference
     parameters["detect"] |= {"boq": str(request.boq.resolve()), "intermediate": False}
     return parameters
 
@@ -171,6 +177,7 @@ def _settings(request: Request, inputs: _Inputs) -> dict[str, Any]:
             "camera_info_topic": inputs.bag.camera_info_topic,
             "motion_topics": inputs.bag.motion_topics,
             "rate": request.rate,
+            **({"reference": str(request.reference)} if request.reference else {}),
         },
     }
 

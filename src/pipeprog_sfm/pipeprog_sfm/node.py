@@ -7,11 +7,13 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMsg
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -37,6 +39,7 @@ from pipeprog_node.received_keyframes import ReceivedRetirement
 from pipeprog_node.received_motion import ReceivedAcceleration, ReceivedTransform, ReceivedTransforms
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
+from pipeprog_sfm.alignment.map_file import read_map
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 from pipeprog_sfm.camera_transforms import FRAME, CameraTransforms
 from pipeprog_sfm.config import SfmConfig
@@ -162,7 +165,7 @@ class MapOutput:
         self._map_trajectory: Trajectory | None = None
         self._overlap = node.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.kept(50))
         self._points = node.create_publisher(PointCloud2, "map_points", qos.latched())
-        self._poses = node.create_publisher(Path, "keyframe_poses", qos.latched())
+        self._poses = node.create_publisher(PathMsg, "keyframe_poses", qos.latched())
         # With a rolling shutter only.
         self._velocities: Publisher[msg.KeyframeVelocities] | None = None
         self._statuses = node.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
@@ -254,13 +257,16 @@ class SfmNode(Node):
 
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("sfm", parameter_overrides=list(overrides))
-        config = declare(self, SfmConfig, extra=("board", "colmap", "lockstep", "intermediate", "publish_tf"))
+        extra = ("board", "colmap", "lockstep", "intermediate", "publish_tf", "reference")
+        config = declare(self, SfmConfig, extra=extra)
         board = declare_fixed(self, "board", "", "file of the boards on site")
         intermediate = declare_fixed(
             self, "intermediate", True, "publish maps while keyframes come, not the last alone"
         )
-        self._arguments = config, load_board_file(board) if board else BoardFile(), intermediate
-        self._colmap = declare_fixed(self, "colmap", "", "folder for the sparse model")
+        reference = declare_fixed(self, "reference", "", "map.npz of the survey in whose frame the map is to lie")
+        earlier = read_map(Path(reference)) if reference else None
+        self._arguments = config, load_board_file(board) if board else BoardFile(), intermediate, earlier
+        self._colmap = declare_fixed(self, "colmap", "", "folder for the sparse model, beside which map.npz goes")
         self._lockstep = declare_fixed(self, "lockstep", False, "every message counts, as in a replay")
         publish_tf = declare_fixed(self, "publish_tf", False, "publish map -> camera of the keyframes on /tf")
         self._transforms = CameraTransforms(self) if publish_tf else None

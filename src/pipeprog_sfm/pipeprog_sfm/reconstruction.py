@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +18,9 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.rolling_shutter import RowMotion
+from pipeprog_sfm.alignment.alignment import Alignment, align
+from pipeprog_sfm.alignment.placing import NotAlignedError
+from pipeprog_sfm.alignment.survey_map import MappedBoard, SurveyMap, sparse_part, thinned
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.camera_in_use import CameraInUse, board_agrees, radial_warning
 from pipeprog_sfm.config import SfmConfig
@@ -25,7 +28,7 @@ from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, centre
 from pipeprog_sfm.dense.depth_fusion import FusedCloud
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
-from pipeprog_sfm.metric.scale import NoScaleError, ScaleEstimate
+from pipeprog_sfm.metric.scale import DISAGREEMENT, NoScaleError, ScaleEstimate
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.metric.unrolled_ellipses import RollingViews
@@ -108,9 +111,16 @@ class Reconstruction:
         config: settings.
         board_file: boards, scale bars and known distances that may be seen.
         sources: what measures the scale; `(*SOURCES, own)` adds a source of one's own (examples/own_scale_source.py).
+        reference: map of an earlier survey, in whose frame the final map is to lie.
     """
 
-    def __init__(self, config: SfmConfig, board_file: BoardFile, sources: Sequence[ScaleSource] = SOURCES) -> None:
+    def __init__(
+        self,
+        config: SfmConfig,
+        board_file: BoardFile,
+        sources: Sequence[ScaleSource] = SOURCES,
+        reference: SurveyMap | None = None,
+    ) -> None:
         self._mapper = Mapper(config.mapper, config.seed, readout=max(config.readout, 0.0))
         self._map = self._mapper.map
         self._config = config
@@ -127,6 +137,9 @@ class Reconstruction:
         self._reason = "no keyframe has been registered yet"
         self._problem = ""
         self._radial_warning = ""
+        self._reference = reference
+        self._alignment: Alignment | None = None
+        self._not_aligned = ""
 
     def add(self, stamp: int, encoded: bytes, camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe (JPEG or PNG bytes, stamp in ns, the camera's frame); InputError when it cannot be used."""
@@ -143,6 +156,7 @@ class Reconstruction:
             )
         camera = self._camera.of(camera)
         self._images[stamp] = EncodedImage(encoded, camera)
+        self._alignment = None  # it is of the last final map
         # Features and boards are measured in the image as it is: their points are undistorted, not resampled.
         self._sightings += bool(self._metric_tracker.add(stamp, gray, camera, frame))
         report = self._mapper.add(stamp, gray, camera, frame)
@@ -186,6 +200,8 @@ class Reconstruction:
             self._mapper.finish()
         self._radial_warning = radial_warning(self._map.radial_residuals())
         self._scaled = -1
+        if self._reference is not None:
+            self._align(self._reference)
         self._request(settled=True, anew=True)
         return self._take()
 
@@ -200,13 +216,25 @@ class Reconstruction:
         ]
         write_model(folder, views, points @ scale.map_from_model[:3, :3].T + scale.map_from_model[:3, 3])
 
+    def survey_map(self, cloud: FusedCloud) -> SurveyMap:
+        """What the next survey of this site is aligned with; `cloud`: of the final map."""
+        scale, _ = self._metric()
+        survey = sparse_part(self._map.published, self._map.keyframes, scale.map_from_model, scale.scale)
+        points, normals = thinned(cloud.points, cloud.normals)
+        linear, shift = scale.map_from_model[:3, :3], scale.map_from_model[:3, 3]
+        boards = tuple(MappedBoard(b.board.name, b.circles_in_model @ linear.T + shift) for b in scale.boards)
+        survey = replace(survey, scale_sigma=scale.sigma, boards=boards, cloud=points, normals=normals)
+        if self._alignment is None or self._reference is None:
+            return survey
+        return replace(survey, frame=self._reference.frame, aligned_by=self._alignment.by)
+
     def overlap_reports(self) -> list[OverlapReport]:
         """Overlap of the keyframes that changed since the last call (Eq. 1)."""
         return self._map.overlap_reports()
 
     def status(self) -> Status:
         """Health so far."""
-        warnings = (*self._scale.warnings, self._radial_warning) if self._scale else ()
+        warnings = (self._not_aligned, *self._scale.warnings, self._radial_warning) if self._scale else ()
         message = self._problem or ("; ".join(filter(None, warnings)) if self._scale else self._reason)
         if len(self._map.models) > 1:
             elsewhere = len(self._map.keyframes) - len(self._map.waiting) - len(self._map.published)
@@ -325,7 +353,27 @@ class Reconstruction:
             velocities[:, row] = scale * motion.linear, motion.angular
         return Velocities(self._map.readout, *velocities)
 
+    def _align(self, reference: SurveyMap) -> None:
+        """Puts the model that is published into the frame of the reference, or notes why not."""
+        self._alignment, self._not_aligned = None, ""
+        self._estimate_scale()
+        model = self._map.published
+        boards = self._scale.boards if self._scale else ()
+        try:
+            if not len(model):
+                raise NotAlignedError("nothing was reconstructed")
+            self._alignment = align(model, self._map.keyframes, boards, reference, self._config.seed)
+        except NotAlignedError as error:
+            self._not_aligned = f"not aligned with the reference, so the map is in a frame of its own: {error}"
+            self._reason = f"{self._reason}; {self._not_aligned}"
+
     def _estimate_scale(self) -> None:
+        """The scale of its own, or that of the reference where the survey is aligned with one."""
+        self._estimate_own_scale()
+        if self._alignment is not None and self._reference is not None:
+            self._scale = in_frame_of(self._reference, self._alignment, self._scale)
+
+    def _estimate_own_scale(self) -> None:
         """Publishes the largest model that has a scale; the reason is that of the largest one."""
         self._scale = None
         models = sorted(self._map.models, key=len, reverse=True)
@@ -350,6 +398,31 @@ class Reconstruction:
                 continue
             self._map.publish(first)
             return
+
+
+def in_frame_of(reference: SurveyMap, alignment: Alignment, own: ScaleEstimate | None) -> ScaleEstimate:
+    """The scale and frame of a reference for a survey that was aligned with it; `own`: what it measured itself."""
+    sigma = float(np.hypot(reference.scale_sigma, alignment.scale_sigma))
+    frame = f"that of the reference, found again by its {alignment.by}"
+    if own is None:
+        pose = alignment.reference_from_model
+        return ScaleEstimate(alignment.scale, sigma, "reference", (), pose, frame, (), (), ())
+    gap, spread = np.log(own.scale / alignment.scale), np.hypot(sigma, own.sigma)
+    warnings = own.warnings
+    if abs(gap) > DISAGREEMENT * spread:
+        warnings += (
+            f"this survey's own scale ({own.source}) is {100 * np.expm1(gap):+.2f} % off that of the reference, more "
+            f"than three times their uncertainty ({100 * spread:.2f} %): is the board the one that its file describes?",
+        )
+    return replace(
+        own,
+        scale=alignment.scale,
+        sigma=sigma,
+        source="+".join(dict.fromkeys(("reference", *own.source.split("+")))),
+        map_from_model=alignment.reference_from_model,
+        frame=frame,
+        warnings=warnings,
+    )
 
 
 def _rolling(model: SparseModel, motions: dict[int, RowMotion]) -> RollingViews | None:

@@ -19,6 +19,8 @@ from typing import Protocol
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
+from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.metric.transform_tree import RobotMotion
@@ -56,7 +58,10 @@ class Retire:
 
 @dataclass(frozen=True)
 class Finish:
-    """Command: no more keyframes come; publish the final map, and write the sparse model where a folder is named."""
+    """Command: no more keyframes come; publish the final map.
+
+    colmap: folder for the sparse model, beside which the map of the survey goes; empty: neither is written.
+    """
 
     motion: RobotMotion = field(default_factory=RobotMotion)
     colmap: str = ""
@@ -125,14 +130,16 @@ def serve(
     config: SfmConfig,
     board_file: BoardFile,
     intermediate: bool,
+    reference: SurveyMap | None,
     answered: Iterable[AddKeyframe | Retire],
 ) -> None:
     """Processes commands from `connection` until it closes; those that a predecessor has answered come first.
 
-    Without `intermediate`, the only map is the one that Finish asks for.
+    Without `intermediate`, the only map is the one that Finish asks for, in the frame of the reference if there is one.
     """
     warm_up(config)
-    work(connection, Reconstruction(config, board_file), config.map_interval if intermediate else None, answered)
+    reconstruction = Reconstruction(config, board_file, reference=reference)
+    work(connection, reconstruction, config.map_interval if intermediate else None, answered)
 
 
 def work(
@@ -159,7 +166,7 @@ def work(
             command = channel.recv()
             if isinstance(command, Finish):
                 reconstruction.move(command.motion)
-                channel.send(_finish(channel, reconstruction, command.colmap))
+                channel.send(_finish(channel, reconstruction, command))
                 since_map, settled = 0, True  # a map after the last one would have a stamp that no pipes have
                 continue
             channel.send(_answer(reconstruction, command))
@@ -203,12 +210,14 @@ def _add(reconstruction: Reconstruction, keyframe: AddKeyframe) -> KeyframeDone:
     return KeyframeDone(keyframe.stamp, keyframe.frame, reconstruction.status(), overlaps, trajectory)
 
 
-def _finish(channel: Channel, reconstruction: Reconstruction, colmap: str) -> Finished:
+def _finish(channel: Channel, reconstruction: Reconstruction, command: Finish) -> Finished:
     try:
         metric_map = reconstruction.finish()
     except NotMetricError as error:
         return Finished(reconstruction.status(), str(error))
     channel.send(MapReady(reconstruction.status(), metric_map))
-    if colmap:
-        reconstruction.write_colmap(Path(colmap))
+    if command.colmap:
+        folder = Path(command.colmap)
+        reconstruction.write_colmap(folder)
+        write_map(folder.parent / MAP_FILE, reconstruction.survey_map(metric_map.cloud))
     return Finished(reconstruction.status(), "")

@@ -6,8 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scenes import CAMERA, STEP, corner, pose, view
 
 from pipeprog_camera.arrays import FloatArray
@@ -54,7 +56,7 @@ def painted(features: Features) -> Features:
     return replace(features, descriptors=np.roll(features.descriptors, 40, axis=1))
 
 
-def walk(xs: FloatArray, night: int, look: Callable[[Features], Features] = as_it_is) -> Night:
+def walk(xs: NDArray[Any], night: int, look: Callable[[Features], Features] = as_it_is) -> Night:
     """A walk along the corner on a night, which is the seed of its noise."""
     mapper, truth = Mapper(MapperConfig()), {}
     for n, x in enumerate(xs.tolist()):

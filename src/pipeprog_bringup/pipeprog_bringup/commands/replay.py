@@ -59,6 +59,15 @@ def replay(
     no_cloud: Annotated[
         bool, typer.Option("--no-cloud", help="Write no cloud.ply and cloud.las, the largest files but for out.mcap.")
     ] = False,
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            "--reference",
+            help="Results of an earlier survey of the site, in whose frame these are to lie. "
+            "Example: `--reference out/monday`",
+            metavar="DIR",
+        ),
+    ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -87,6 +96,7 @@ def replay(
         odometry_topic,
         imu_topic,
         not no_cloud,
+        reference,
     )
     with replay_bars(quiet) as show, state_file(progress, show) as report:
         outcome = run(request, report)

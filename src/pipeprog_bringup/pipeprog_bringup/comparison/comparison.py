@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.results.lives import NUMBERED
 from pipeprog_bringup.results.results_reader import Results
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.coverage.changes import Change, KnownPipe, changes
@@ -64,8 +65,11 @@ def compare(surveys: Sequence[Results]) -> list[Step]:
     A pipe that a survey has not seen is known on. Raises OtherSiteError where two are not surveys of one site, and
     InputError where they cannot be compared.
     """
-    known: list[tuple[str, KnownPipe]] = [(f"p{number:02d}", pipe) for number, pipe in enumerate(_pipes(surveys[0]), 1)]
-    most = len(known)
+    known: list[tuple[str, KnownPipe]] = [
+        (str(row.get("life", row["id"])), pipe) for row, pipe in zip(surveys[0].pipes, _pipes(surveys[0]), strict=True)
+    ]
+    most = max((int(found[1]) for life, _ in known if (found := NUMBERED.fullmatch(life))), default=0)
+    lived = {life for life, _ in known}
     steps = []
     for earlier, later in pairwise(surveys):
         views = survey_views(later)
@@ -79,7 +83,8 @@ def compare(surveys: Sequence[Results]) -> list[Step]:
                 life, old = known[number]
             else:
                 most += 1
-                life, old = f"p{most:02d}", after[change.after[0]]
+                life, old = _new_life(later, change.after[0], lived, most), after[change.after[0]]
+                lived.add(life)
             lives.append(LifeChange(life, replace(change, before=(life,) if change.before else ())))
             following += [(life, after[name]) for name in change.after]
             if change.state == "not_seen":
@@ -127,6 +132,12 @@ def as_json(steps: Sequence[Step]) -> list[dict[str, Any]]:
     ]
 
 
+def _new_life(survey: Results, name: str, lived: Collection[str], number: int) -> str:
+    """The life of a pipe that is new: the one that its survey has given it, where no other pipe has it."""
+    given = next((row.get("life") for row in survey.pipes if row["id"] == name), None)
+    return str(given) if given is not None and given not in lived else f"p{number:02d}"
+
+
 def _pipes(results: Results) -> list[KnownPipe]:
     return [
         KnownPipe(str(row["id"]), cylinder, str(row["class"] or ""), row.get("length_sigma"))
@@ -137,17 +148,9 @@ def _pipes(results: Results) -> list[KnownPipe]:
 def _check_frames(earlier: Results, later: Results, views: Sequence[View]) -> None:
     """Raises InputError where nothing puts two surveys into one frame, OtherSiteError where they do not agree in it."""
     pair = f"{earlier.folder} and {later.folder}"
-    for results in (earlier, later):
-        if "board" not in str(results.scale.get("source", "")):
-            raise InputError(
-                f"{pair} cannot be compared: {results.folder} was measured without a board, so its frame is its own: "
-                "hang up the same board at each survey"
-            )
-    boards = [sorted(map(str, each.config.get("boards") or [])) for each in (earlier, later)]
-    if boards[0] and boards[1] and boards[0] != boards[1]:
-        raise OtherSiteError(
-            f"{pair} are not surveys of one site: their boards are {', '.join(boards[0])} and {', '.join(boards[1])}"
-        )
+    is_aligned = earlier.frame is not None and earlier.frame == later.frame
+    if not is_aligned:
+        _check_boards(earlier, later)
     points = earlier.points[:: max(1, len(earlier.points) // LOOKED_FOR)]
     told = sights(points, np.full(len(points), POINT_RADIUS), views)
     there, through = int((told == Sight.OPEN).sum()), int((told == Sight.EMPTY).sum())
@@ -155,6 +158,22 @@ def _check_frames(earlier: Results, later: Results, views: Sequence[View]) -> No
         raise OtherSiteError(
             f"{pair} are not surveys of one site, or their boards hang elsewhere: of the surfaces of the first that "
             f"the second has in view, it sees {100 * there / (there + through):.0f} % where they were"
+        )
+
+
+def _check_boards(earlier: Results, later: Results) -> None:
+    """Raises InputError where two surveys that were not aligned have not measured the same boards either."""
+    pair = f"{earlier.folder} and {later.folder}"
+    for results in (earlier, later):
+        if "board" not in str(results.scale.get("source", "")):
+            raise InputError(
+                f"{pair} cannot be compared: {results.folder} was measured without a board, so its frame is its own: "
+                "replay it with --reference, or hang up the same board at each survey"
+            )
+    boards = [sorted(map(str, each.config.get("boards") or [])) for each in (earlier, later)]
+    if boards[0] and boards[1] and boards[0] != boards[1]:
+        raise OtherSiteError(
+            f"{pair} are not surveys of one site: their boards are {', '.join(boards[0])} and {', '.join(boards[1])}"
         )
 
 

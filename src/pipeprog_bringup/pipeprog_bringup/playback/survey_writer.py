@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Transform, TransformStamped, Vector3
@@ -20,26 +22,38 @@ from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import write_las, write_ply
+from pipeprog_bringup.results.lives import Lives, lives_after
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.coverage.survey import SurveyCoverage, survey_coverage, views_of
 from pipeprog_detect.product.boq import PlannedPipe
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun
 from pipeprog_detect.product.product import Product
-from pipeprog_detect.types import Cylinder, Pipe, PipeEnd
+from pipeprog_detect.types import Cylinder, Pipe, PipeEnd, View
 from pipeprog_msgs import msg
 from pipeprog_node import messages
+from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map, write_map
+from pipeprog_sfm.alignment.survey_map import MappedPipe, SurveyMap
 
 _SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}
 
 
 def write_survey(
-    folder: OutputFolder, survey: LastMessages, log: FrameLog, coverage: SurveyCoverage, with_cloud: bool
+    folder: OutputFolder,
+    survey: LastMessages,
+    log: FrameLog,
+    seen: Seen,
+    with_cloud: bool,
+    reference: SurveyMap | None = None,
 ) -> Product:
-    """Write pipes.json, progress.csv, trajectory.tum, frames.csv, cloud.ply and .las if wanted; returns the product."""
-    product = product_from_msg(survey.pipes)
+    """Write pipes.json, progress.csv, trajectory.tum, frames.csv, cloud.ply and .las if wanted; returns the product.
+
+    The map.npz that the SfM has written gets the pipes; `reference`: the survey in whose frame it was to lie.
+    """
+    product, coverage = product_from_msg(survey.pipes), seen.coverage
     scale = result_files.Scale(survey.pipes.scale_source, survey.pipes.scale_sigma)
-    result_files.write_pipes(folder.file("pipes.json"), product, scale, coverage)
+    lives = complete_map(folder.file(MAP_FILE), product, seen.views, reference)
+    result_files.write_pipes(folder.file("pipes.json"), product, scale, coverage, lives)
     result_files.write_progress(folder.file("progress.csv"), product, coverage)
     if with_cloud:
         points, normals = messages.points_from_cloud(survey.cloud)
@@ -57,14 +71,46 @@ def write_survey(
     return product
 
 
-def coverage_of(survey: LastMessages, cameras: Mapping[int, Camera], planned: Sequence[PlannedPipe]) -> SurveyCoverage:
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What the keyframes had in view: they themselves, with depths, and what that tells of pipes and walls."""
+
+    views: list[View]
+    coverage: SurveyCoverage
+
+
+def seen_by(survey: LastMessages, cameras: Mapping[int, Camera], planned: Sequence[PlannedPipe]) -> Seen:
     """What the keyframes had in view, whose cameras are given by stamp; `planned` are the pipes that have places."""
     product = product_from_msg(survey.pipes)
     points = messages.points_from_cloud(survey.cloud)[0].astype(float)
     stamps, poses = messages.poses_from_path(survey.poses)
     kept = [row for row, stamp in enumerate(stamps.tolist()) if stamp in cameras]
     views = views_of([cameras[int(stamps[row])] for row in kept], poses[kept], points)
-    return survey_coverage(product.pipes, planned, [entry.outer_radius for entry in product.classes], points, views)
+    radii = [entry.outer_radius for entry in product.classes]
+    return Seen(views, survey_coverage(product.pipes, planned, radii, points, views))
+
+
+def complete_map(
+    path: Path, product: Product, views: Sequence[View], reference: SurveyMap | None
+) -> dict[str, str] | None:
+    """Gives the map that the SfM has written the pipes of the survey; returns their lives where it was aligned."""
+    if not path.is_file():  # the SfM died while it wrote
+        return None
+    survey_map = read_map(path)
+    is_aligned = reference is not None and survey_map.aligned_by
+    lives = lives_after(reference, product, views) if reference is not None and is_aligned else Lives({})
+    own = [
+        MappedPipe(
+            lives.of.get(pipe.id, pipe.id),
+            pipe.class_name or "",
+            np.stack([pipe.cylinder.start, pipe.cylinder.end]),
+            pipe.cylinder.radius,
+            product.length_sigma(pipe),
+        )
+        for pipe in product.pipes
+    ]
+    write_map(path, dataclasses.replace(survey_map, pipes=(*own, *lives.unseen)))
+    return lives.of if is_aligned else None
 
 
 def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmStatus) -> None:

@@ -119,6 +119,8 @@ def _check_pipe(pipe: dict[str, Any], where: str) -> None:
     if not isinstance(pipe.get("id"), str):
         raise InputError(f"id of {where} is {shown(pipe.get('id'))}, not a name")
     name_of(pipe["id"], f"the id of {where}")
+    if "life" in pipe:
+        name_of(pipe["life"], f"the life of {where}")
     for row in rows_of({"ends": [], **pipe}, "ends", 2):
         _check_end(row, f"an end of {where}")
     if "class" not in pipe:

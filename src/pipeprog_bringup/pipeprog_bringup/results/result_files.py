@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from decimal import Decimal, InvalidOperation
@@ -67,8 +67,17 @@ class FrameRow:
     tie_points: int | None = None
 
 
-def write_pipes(path: Path, product: Product, scale: Scale, coverage: SurveyCoverage | None = None) -> None:
-    """pipes.json, one line a pipe; lengths rounded to the micrometre, far below the error of any measurement."""
+def write_pipes(
+    path: Path,
+    product: Product,
+    scale: Scale,
+    coverage: SurveyCoverage | None = None,
+    lives: Mapping[str, str] | None = None,
+) -> None:
+    """pipes.json, one line a pipe; lengths rounded to the micrometre, far below the error of any measurement.
+
+    `lives`: of each pipe by its id, the id for its life; known in the frame of an earlier survey.
+    """
     head: dict[str, Any] = {
         "frame_id": "map",
         "scale": {"source": scale.source, "sigma": _significant(scale.sigma)},
@@ -78,6 +87,9 @@ def write_pipes(path: Path, product: Product, scale: Scale, coverage: SurveyCove
         "classes": [_class_entry(entry, product) for entry in product.classes],
         "runs": [_run_entry(run) for run in product.runs],
     }
+    if lives is not None:
+        for row in rows["pipes"]:
+            row["life"] = lives[row["id"]]
     if coverage is not None:
         head["walls_m2"] = round(coverage.walls.area, 1)
         for row, own in zip(rows["pipes"], coverage.pipes, strict=True):

@@ -24,6 +24,7 @@ from pipeprog_camera.limits import MAX_TABLE
 from pipeprog_camera.text_file import read_text
 from pipeprog_camera.yaml_file import read_yaml
 from pipeprog_detect.types import Cylinder
+from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
 
 Color = tuple[float, float, float]
 
@@ -110,6 +111,12 @@ class Results:
     def cloud(self) -> CloudFile | None:
         """The cloud with its normals and colours, read when it is first asked for."""
         return None if self.cloud_path is None else read_cloud(self.cloud_path)
+
+    @cached_property
+    def frame(self) -> str | None:
+        """Name of the frame `map`, the same for surveys that were aligned with each other; None without map.npz."""
+        path = self.folder / MAP_FILE
+        return read_map(path).frame if path.is_file() else None
 
     @property
     def points(self) -> FloatArray:

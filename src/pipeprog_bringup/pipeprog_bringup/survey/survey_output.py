@@ -13,9 +13,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.playback.listener import LastMessages
 from pipeprog_bringup.playback.survey_writer import (
-    coverage_of,
     record_cameras,
     record_survey,
+    seen_by,
     type_name,
     write_survey,
 )
@@ -84,8 +84,8 @@ class SurveyOutput:
         if survey is not None:
             record_survey(self._recording, survey, status)
             cameras = record_cameras(self._recording, survey, self._infos)
-            coverage = coverage_of(survey, cameras, self._goal.site.boq.pipes)
-            write_survey(self._folder, survey, log, coverage, with_cloud=True)
+            seen = seen_by(survey, cameras, self._goal.site.boq.pipes)
+            write_survey(self._folder, survey, log, seen, with_cloud=True)
         else:
             result_files.write_frames(self._folder.file("frames.csv"), log.rows())
         if self._goal.site.boq.pipes:
