@@ -226,7 +226,12 @@ class Reconstruction:
         survey = replace(survey, scale_sigma=scale.sigma, boards=boards, cloud=points, normals=normals)
         if self._alignment is None or self._reference is None:
             return survey
-        return replace(survey, frame=self._reference.frame, aligned_by=self._alignment.by)
+        return replace(
+            survey,
+            frame=self._reference.frame,
+            aligned_by=self._alignment.by,
+            alignment_covariance=self._alignment.covariance,
+        )
 
     def overlap_reports(self) -> list[OverlapReport]:
         """Overlap of the keyframes that changed since the last call (Eq. 1)."""

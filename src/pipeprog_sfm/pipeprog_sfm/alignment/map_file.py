@@ -49,6 +49,7 @@ def write_map(path: Path, survey: SurveyMap) -> None:
         "version": np.array(VERSION, np.int32),
         "frame": _texts([survey.frame, survey.aligned_by]),
         "scale_sigma": np.array(survey.scale_sigma),
+        "alignment": survey.alignment_covariance.astype(np.float64),
         "stamps": survey.stamps.astype(np.int64),
         "poses": survey.map_from_camera[:, :3].astype(np.float64),
         "camera_of": np.array([cameras.index(camera) for camera in survey.cameras], np.int32),
@@ -109,6 +110,7 @@ _ARRAYS = {
     "version": _Kind("int32", ()),
     "frame": _Kind("U", (None,), 2),
     "scale_sigma": _Kind("float64", ()),
+    "alignment": _Kind("float64", (7, 7), 7, 1e6),
     "stamps": _Kind("int64", (None,), MAX_POSES),
     "poses": _Kind("float64", (None, 3, 4), MAX_POSES, MAX_COORDINATE),
     "camera_of": _Kind("int32", (None,), MAX_POSES),
@@ -195,6 +197,7 @@ def _survey(arrays: dict[str, NDArray[Any]]) -> SurveyMap:
         cloud=(arrays["cloud_origin"] + arrays["cloud"] * CLOUD_STEP).astype(np.float32),
         normals=(arrays["normals"] * NORMAL_STEP).astype(np.float32),
         pipes=_pipes(arrays),
+        alignment_covariance=arrays["alignment"],
     )
 
 

@@ -44,6 +44,10 @@ def _nothing() -> NDArray[np.float32]:
     return np.empty((0, 3), np.float32)
 
 
+def _certain() -> FloatArray:
+    return np.zeros((7, 7))
+
+
 @dataclass(frozen=True)
 class SurveyMap:
     """The map of a survey, in its frame `map` [m].
@@ -52,6 +56,7 @@ class SurveyMap:
         frame: name of the frame; surveys that were aligned with each other have the same.
         aligned_by: `boards` or `places`; empty where the frame is the survey's own.
         scale_sigma: relative standard deviation of its metres.
+        alignment_covariance: (7, 7) of shift [m], turn [rad] and logarithm of the scale; zero in a frame of its own.
         stamps: (V,) int64 of the keyframes [ns].
         cameras: one for each keyframe.
         map_from_camera: (V, 4, 4).
@@ -80,6 +85,7 @@ class SurveyMap:
     cloud: NDArray[np.float32] = field(default_factory=_nothing)
     normals: NDArray[np.float32] = field(default_factory=_nothing)
     pipes: tuple[MappedPipe, ...] = ()
+    alignment_covariance: FloatArray = field(default_factory=_certain)
 
     def keyframes(self) -> list[Keyframe]:
         """The keyframes with the features that were kept."""
