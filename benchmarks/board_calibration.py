@@ -58,7 +58,8 @@ def measured(path: Path, seed: int) -> dict[str, Any]:
     seconds, cpu = time.monotonic() - started, time.process_time() - cpu
     truth = json.loads(path.with_suffix(".truth.json").read_text())
     camera = found.camera
-    true = Camera(camera.width, camera.height, *truth["camera"], "plumb_bob", tuple(truth["distortion"]))
+    fx, fy, cx, cy = truth["camera"]
+    true = Camera(camera.width, camera.height, fx, fy, cx, cy, "plumb_bob", tuple(truth["distortion"]))
     readout = found.readout or 0.0
     row = {
         "commit": commit(),

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeprog_bringup.footage.camera_file import read_camera_file
 from pipeprog_bringup.footage.guessed_camera import GUESS_SIGMA, guessed_camera
+from pipeprog_bringup.footage.pictures import Pictures
 from pipeprog_bringup.footage.polycam import Polycam
 from pipeprog_bringup.footage.record3d import Record3D
 from pipeprog_bringup.footage.shot import Excerpt, Footage, Shot
@@ -34,7 +35,7 @@ IMAGE_TOPIC, INFO_TOPIC = "/camera/image/compressed", "/camera/camera_info"
 
 @dataclass(frozen=True)
 class Request:
-    """What to ingest: a video with its calibration, or an app's recording; JPEG `quality` of decoded pictures."""
+    """What to ingest: a video or pictures with their camera, or an app's scan; JPEG `quality` of decoded ones."""
 
     source: Path
     camera: Path | None
@@ -66,7 +67,10 @@ def ingest(request: Request, report: Callable[[float, str], None]) -> Ingested:
     is_guess = footage is None and calibration is None
     if footage is None:
         camera = calibration.camera if calibration else guessed_camera(request.source)
-        footage = Video(request.source, camera, request.camera or request.source)
+        if request.source.is_dir():
+            footage = Pictures(request.source, camera)
+        else:
+            footage = Video(request.source, camera, request.camera or request.source)
     stamps: list[int] = []
     encoded = 0
     with output_file(request.out, request.force) as temporary, temporary.open("wb") as stream, BagWriter(stream) as bag:
@@ -88,19 +92,23 @@ def ingest(request: Request, report: Callable[[float, str], None]) -> Ingested:
 
 
 def _app(source: Path) -> Footage | None:
-    """What an app has recorded, by its form; None for a file that may be a video, InputError for any other folder."""
+    """What an app has recorded, by its form; None for a video or pictures, InputError for any other folder."""
     if (source / "odometry.csv").is_file():
         return StrayScanner(source)
     if (source / "keyframes").is_dir():
         return Polycam(source)
     if source.suffix == ".r3d" and source.is_file():
         return Record3D(source)
-    if source.exists() and not source.is_file():
+    if source.exists() and not source.is_file() and not (source.is_dir() and _has_pictures(source)):
         raise InputError(
             f"{source} is a folder, a device or a pipe, and no scan of Stray Scanner or Polycam (raw data): "
-            "give such a folder, or a video file"
+            "give such a folder, one of JPEG pictures, or a video file"
         )
     return None
+
+
+def _has_pictures(folder: Path) -> bool:
+    return any(file.suffix.lower() in (".jpg", ".jpeg") for file in folder.iterdir())
 
 
 def _write(bag: BagWriter, shot: Shot, quality: int) -> None:

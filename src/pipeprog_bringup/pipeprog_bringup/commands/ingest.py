@@ -17,7 +17,8 @@ def ingest(
     video: Annotated[
         Path,
         typer.Argument(
-            help="Video (mp4, mov, ...), folder of Stray Scanner or Polycam, or .r3d of Record3D. Example: `walk.mp4`",
+            help="Video (mp4, mov, ...), folder of JPEG pictures, of Stray Scanner or Polycam, or .r3d of Record3D. "
+            "Example: `walk.mp4`",
             metavar="VIDEO",
         ),
     ],
