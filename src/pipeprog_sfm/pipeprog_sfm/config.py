@@ -49,6 +49,13 @@ class CalibrationConfig:
         "",
         (1e-6, 1.0),
     )
+    readout_sigma: float = setting(
+        # Read-outs that users measured of phones of one kind differ by 30 %, mostly with the recording mode.
+        0.3,
+        "relative standard deviation of a read-out that is told; 0: it is taken as it is",
+        "",
+        (0.0, 1.0),
+    )
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,7 @@ class SfmConfig:
     readout: float = setting(
         NOT_TOLD,
         "rolling shutter: time from the first row of an image to the last; 0: all rows at once; -1: not told, "
-        "taken as 0",
+        "taken from the images where they tell it",
         "s",
         (NOT_TOLD, MAX_READOUT),
     )

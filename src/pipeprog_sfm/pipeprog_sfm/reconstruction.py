@@ -23,7 +23,7 @@ from pipeprog_sfm.alignment.placing import NotAlignedError
 from pipeprog_sfm.alignment.survey_map import MappedBoard, SurveyMap, sparse_part, thinned
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.camera_in_use import CameraInUse, board_agrees, radial_warning
-from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.config import NOT_TOLD, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, centre
 from pipeprog_sfm.dense.depth_fusion import FusedCloud
@@ -37,6 +37,8 @@ from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.sparse.overlap import OverlapReport
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.types import EncodedImage
+
+READOUT_ROUNDS = 3  # of read-out and poses in turns: velocities follow the poses, a round leaves a tenth of the error
 
 
 class NotMetricError(Exception):
@@ -121,12 +123,13 @@ class Reconstruction:
         sources: Sequence[ScaleSource] = SOURCES,
         reference: SurveyMap | None = None,
     ) -> None:
-        self._mapper = Mapper(config.mapper, config.seed, readout=max(config.readout, 0.0))
+        told = None if config.readout == NOT_TOLD else config.readout
+        self._mapper = Mapper(config.mapper, config.seed, readout=told or 0.0)
         self._map = self._mapper.map
         self._config = config
         self._deblurrer = Deblurrer(config)
         self._metric_tracker = MetricTracker(board_file, config.board, config.odometry, sources)
-        self._camera = CameraInUse(config.calibration)
+        self._camera = CameraInUse(config.calibration, told)
         self._images: dict[int, EncodedImage] = {}
         self._dense = DenseMapper(config.stereo, config.fusion)
         self._pending: tuple[ScaleEstimate, Trajectory, Future[FusedCloud]] | None = None
@@ -136,7 +139,7 @@ class Reconstruction:
         self._due = 0.0  # sightings at which the scale is estimated again
         self._reason = "no keyframe has been registered yet"
         self._problem = ""
-        self._radial_warning = ""
+        self._camera_warning = ""
         self._reference = reference
         self._alignment: Alignment | None = None
         self._not_aligned = ""
@@ -196,9 +199,15 @@ class Reconstruction:
     def finish(self) -> MetricMap:
         """Registers what still can be, adjusts everything, and makes the final map; raises NotMetricError."""
         self._mapper.finish()
-        if self._camera.config.focal_sigma > 0 and self._refine_camera(final=True):
+        for _ in range(READOUT_ROUNDS if self._camera.refines else 0):
+            before = self._map.readout
+            if not self._refine_camera(final=True):
+                break
             self._mapper.finish()
-        self._radial_warning = radial_warning(self._map.radial_residuals())
+            if self._map.readout == before:
+                break
+        warnings = radial_warning(self._map.radial_residuals()), self._camera.readout_warning()
+        self._camera_warning = "; ".join(filter(None, warnings))
         self._scaled = -1
         if self._reference is not None:
             self._align(self._reference)
@@ -239,7 +248,7 @@ class Reconstruction:
 
     def status(self) -> Status:
         """Health so far."""
-        warnings = (self._not_aligned, *self._scale.warnings, self._radial_warning) if self._scale else ()
+        warnings = (self._not_aligned, *self._scale.warnings, self._camera_warning) if self._scale else ()
         message = self._problem or ("; ".join(filter(None, warnings)) if self._scale else self._reason)
         if len(self._map.models) > 1:
             elsewhere = len(self._map.keyframes) - len(self._map.waiting) - len(self._map.published)
@@ -257,6 +266,7 @@ class Reconstruction:
             message,
             self._camera.description(),
             self._map.readout,
+            self._camera.readout_sigma,
         )
 
     def trajectory(self) -> Trajectory:
@@ -304,27 +314,30 @@ class Reconstruction:
     def _refine_camera(self, final: bool) -> bool:
         """Goes on with the camera that the map says, where the boards agree; whether it does."""
         poses = self._map.camera_from_model()
-        if not poses or self._config.readout > 0:  # these residuals are of images whose rows are exposed at once
+        if not poses:
             return False
         used = self._images[next(iter(poses))].camera
-        found = self._mapper.self_calibration(self._camera.told(used), self._camera.config)
+        waiting = bool(self._map.readout) and not final
+        found = self._mapper.self_calibration(self._camera.priors(used, waiting))
         if found is None or not self._camera.is_better(found, final):
             return False
         images = {stamp: image for stamp, image in self._images.items() if image.camera == found.told}
         if len(images) < len(self._images):  # the detector is told one camera for all keyframes
             return False
-        measured = self._metric_tracker.remeasured(
-            ((stamp, image.gray()) for stamp, image in images.items()), found.camera
-        )
-        rolling = _rolling(self._map.published, self._map.motions(self._map.published))
+        measured = self._metric_tracker
+        if found.camera != found.told:
+            measured = measured.remeasured(((stamp, image.gray()) for stamp, image in images.items()), found.camera)
+        model = self._map.published
+        rolling, other = (_rolling(model, self._map.motions(model, each)) for each in (None, found.readout))
         before = self._metric_tracker.board_misfit(poses, rolling)
-        if not board_agrees(before, measured.board_misfit(found.poses, rolling)):
+        if not board_agrees(before, measured.board_misfit(found.poses, other)):
             return False
         self._camera.accept(found)
-        self._metric_tracker = measured
-        for stamp, image in images.items():
-            self._images[stamp] = EncodedImage(image.data, found.camera)
-        self._deblurrer.replace_camera(found.camera)
+        if found.camera != found.told:
+            self._metric_tracker = measured
+            for stamp, image in images.items():
+                self._images[stamp] = EncodedImage(image.data, found.camera)
+            self._deblurrer.replace_camera(found.camera)
         self._mapper.take_camera(found)
         self._dense.clear()
         return True

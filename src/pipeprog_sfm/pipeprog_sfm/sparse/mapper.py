@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import IntArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.config import CalibrationConfig, MapperConfig
+from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
 from pipeprog_sfm.features.sift import Features, extract
@@ -19,8 +19,8 @@ from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, rejection_reason
-from pipeprog_sfm.sparse.row_motion import predicted
-from pipeprog_sfm.sparse.self_calibration import Refinement, refine
+from pipeprog_sfm.sparse.row_motion import predicted, row_motions
+from pipeprog_sfm.sparse.self_calibration import Priors, Refinement, refine
 from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.sparse.two_view import model_from_pair
@@ -124,23 +124,23 @@ class Mapper:
             if len(self._retired) > self._remembered:
                 del self._retired[next(iter(self._retired))]
 
-    def self_calibration(self, told: Camera, config: CalibrationConfig) -> Refinement | None:
-        """The camera that the published model agrees with best; None where that is not known, or of several cameras.
-
-        told: the calibration as it came, to which the priors of `config` apply.
-        """
+    def self_calibration(self, told: Priors) -> Refinement | None:
+        """The camera that the published model agrees with best; None where that is not known, or of several cameras."""
         model = self.map.published
         cameras = {self.map.keyframes[stamp].camera for stamp in model.stamps}
-        return refine(model, self.map.keyframes, told, config) if len(cameras) == 1 else None
+        motions = row_motions(model, self.map.keyframes, self.map.readout) if told.sigmas[3] > 0 else {}
+        return refine(model, self.map.keyframes, told, motions) if len(cameras) == 1 else None
 
     def take_camera(self, refinement: Refinement) -> None:
         """Goes on with a refined camera: the published model has its poses, all else is adjusted to it."""
+        self.map.readout = refinement.readout
         model = self.map.published
         for view, stamp in enumerate(model.stamps):
             pose = refinement.poses[stamp]
             model.rotation[view], model.translation[view] = pose[:3, :3], pose[:3, 3]
-        for stamp, keyframe in self._retired.items():
-            self._retired[stamp] = keyframe.with_camera(refinement.camera)
+        if refinement.camera != refinement.told:
+            for stamp, keyframe in self._retired.items():
+                self._retired[stamp] = keyframe.with_camera(refinement.camera)
         self.map.replace_camera(refinement.told, refinement.camera)
 
     def finish(self) -> None:

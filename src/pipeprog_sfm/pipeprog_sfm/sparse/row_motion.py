@@ -36,6 +36,7 @@ NEAR = 16  # views nearest in time that tell how one moves: a knot has a quarter
 # rad/s and depths of the scene per second, for each second to the next pose: how far the velocity at an end of the
 # spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
 END_CHANGE = 1.0
+READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
 MIN_POINTS = 50  # of a view, from which its own rows tell its velocity: twelve unknowns, and some wrong points
 
 
@@ -97,6 +98,35 @@ def unroll(model: SparseModel, keyframes: MutableMapping[int, Keyframe], motions
         moved = (keyframe.rays - before) * keyframe.focal
         change = max(change, float(np.sqrt((moved**2).sum(axis=1).mean())))
     return change
+
+
+def readout_rates(
+    model: SparseModel, keyframes: Mapping[int, Keyframe], motions: Mapping[int, RowMotion], features: IntArray
+) -> FloatArray:
+    """(K, 2) px of the image as it is, per second by which the read-out grows: how unrolled features move.
+
+    Args:
+        model: views and points.
+        keyframes: of the model's views, by stamp.
+        motions: of the views, by stamp; the features of other views do not move.
+        features: (K,) flat ones that have a point.
+    """
+    rates = np.zeros((len(features), 2))
+    for view, stamp in enumerate(model.stamps):
+        own = np.flatnonzero(model.view_of[features] == view)
+        if stamp not in motions or not len(own):
+            continue
+        keyframe, motion = keyframes[stamp], motions[stamp]
+        measured = keyframe.measured[features[own] - model.offsets[view]].astype(np.float64)
+        depths = model.points[model.point_of[features[own]]] @ model.rotation[view, 2] + model.translation[view, 2]
+        ends = [
+            keyframe.camera.distort_points(
+                replace(motion, readout=motion.readout + step).unrolled_pixels(measured, depths, keyframe.camera)
+            )
+            for step in (0.0, READOUT_STEP)
+        ]
+        rates[own] = (ends[1] - ends[0]) / READOUT_STEP
+    return rates
 
 
 def predicted(model: SparseModel, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], readout: float) -> Keyframe:

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Focal length and radial distortion from the map itself, with the calibration as a prior.
+"""Focal length, radial distortion and read-out from the map itself, with what was told as a prior.
 
 The camera is a small dense block beside the poses of a bundle adjustment: residuals are those of the image as it is,
 so that a camera which shrinks the image gains nothing. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000.
+
+The read-out of a rolling shutter is one more number: the rows' times shift each feature along its own velocity, which
+the trajectory tells. It is told by what changes along a walk, such as sway and turns; a walk at one velocity shears the
+map and leaves no residual, so that its standard deviation, which is part of the result, decides.
 """
 
 from __future__ import annotations
@@ -12,11 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.config import CalibrationConfig
+from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.sparse.bundle_adjustment import (
     CAUCHY,
@@ -27,6 +30,7 @@ from pipeprog_sfm.sparse.bundle_adjustment import (
     pairs_of_views,
     rotation_from_vector,
 )
+from pipeprog_sfm.sparse.row_motion import readout_rates
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map
@@ -36,9 +40,28 @@ SIGNIFICANT = 5.0  # standard deviations of a change: features share errors that
 MAX_ITERATIONS = 15  # of Levenberg-Marquardt; 3 to 6 for a calibration, up to 12 for a guess, are needed
 CONVERGED = 0.1  # of its standard deviation, change of each number at which the iterations end
 STEP = 1e-6  # of numerical derivatives by rays, log focal length, k1 and k2: rounding gives them to 1e-9
-K2_SHARE = 2.0  # standard deviation of k2 over that of k1: it counts half as much where the image's corner has r = 0.7
+HELD = 1e-9  # standard deviation of a number that stays as it is
+# s, below which all rows count as exposed at once: 0.3 px at walking pace, and the fastest rolling shutters take 2 ms.
+LEAST_READOUT = 0.001
+READOUT_SHARE = 0.01  # of a read-out in use, below which a change does not matter: 0.05 px at walking pace
 RADII = 8  # equal areas of the image, as rings, in which residuals are averaged
 MIN_IN_RING = 100  # residuals of a ring: their mean is known to a twentieth of a pixel
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What was told of a camera.
+
+    Attributes:
+        camera: its calibration.
+        readout: s.
+        sigmas: (4,) standard deviations of the logarithm of its focal length, of k1, of k2 and of the read-out [s]; 0
+            for what is not to be refined.
+    """
+
+    camera: Camera
+    readout: float
+    sigmas: FloatArray
 
 
 @dataclass(frozen=True)
@@ -48,14 +71,18 @@ class Refinement:
     Attributes:
         told: the camera that the map was made with.
         camera: the refined one.
-        changes: (3,) of the logarithm of the focal length, of k1 and of k2.
-        sigmas: (3,) their standard deviations; infinite for what the data do not determine, which stays as it was.
-        shift: the most by which it moves a point of the image, px.
+        readout: s.
+        readout_sigma: its standard deviation, also where it stays as it was [s]; 0: it was not looked at.
+        changes: (4,) of the logarithm of the focal length, of k1, of k2 and of the read-out [s].
+        sigmas: (4,) their standard deviations; infinite for what the data do not determine, which stays as it was.
+        shift: the most by which camera or read-out moves a point of the image, px.
         poses: (4, 4) camera_from_model of the views with it, by stamp.
     """
 
     told: Camera
     camera: Camera
+    readout: float
+    readout_sigma: float
     changes: FloatArray
     sigmas: FloatArray
     shift: float
@@ -69,7 +96,7 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _State:
-    """What is adjusted: `numbers` (3,) change the camera's log focal length, k1 and k2."""
+    """What is adjusted: `numbers` (4,) change the camera's log focal length, k1, k2 and its read-out [s]."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -79,7 +106,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Residuals (K, 2), weighted, and their derivatives by pose (K, 2, 6), camera (K, 2, 3) and point (K, 2, 3)."""
+    """Residuals (K, 2), weighted, and their derivatives by pose (K, 2, 6), number (K, 2, 4) and point (K, 2, 3)."""
 
     residuals: FloatArray
     by_pose: FloatArray
@@ -91,10 +118,15 @@ class _Problem:
     """Observations of one camera in the image as it is, in units of their noise."""
 
     def __init__(
-        self, model: SparseModel, camera: Camera, chosen: tuple[IntArray, IntArray, IntArray], prior: FloatArray
+        self,
+        model: SparseModel,
+        camera: Camera,
+        chosen: tuple[IntArray, IntArray, IntArray],
+        rates: FloatArray,
+        prior: FloatArray,
     ) -> None:
         self.ids, self.start, features = chosen
-        self.camera, self.prior = camera, prior
+        self.camera, self.rates, self.prior = camera, rates, prior
         self.view = model.view_of[features].astype(np.int64)
         self.owner = np.repeat(np.arange(len(self.ids)), np.diff(self.start))
         ideal = model.rays[features] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
@@ -106,7 +138,8 @@ class _Problem:
         turned = np.einsum("kij,kj->ki", state.rotation[self.view], state.points[self.owner])
         inside = turned + state.translation[self.view]
         rays = inside[:, :2] / np.maximum(inside[:, 2:], 1e-9)
-        error = (pixels_of(changed(self.camera, state.numbers), rays) - self.pixels) / self.noise
+        measured = self.pixels + state.numbers[3] * self.rates
+        error = (pixels_of(changed(self.camera, state.numbers), rays) - measured) / self.noise
         return error, turned, rays
 
     def cost(self, state: _State, told: FloatArray) -> float:
@@ -121,7 +154,8 @@ class _Problem:
         camera = changed(self.camera, state.numbers)
         root = np.sqrt(1.0 / (1.0 + (error**2).sum(axis=1) / CAUCHY**2)) / self.noise
         by_ray = _derivatives(lambda step: pixels_of(camera, rays + step), 2)
-        by_number = _derivatives(lambda step: pixels_of(changed(self.camera, state.numbers + step), rays), 3)
+        by_number = _derivatives(lambda step: pixels_of(changed(self.camera, state.numbers[:3] + step), rays), 3)
+        by_number = np.concatenate([by_number, -self.rates[:, :, None]], axis=-1)
         depth = turned[:, 2] + state.translation[self.view, 2]
         slope = np.zeros((len(rays), 2, 3))
         slope[:, 0, 0] = slope[:, 1, 1] = 1.0
@@ -152,63 +186,85 @@ class _Reduced:
         hold_scale(blocks, pairs, self.index, state.rotation, state.translation)
         self.poses = factorised(blocks, row, column, count)
         self.by_pose, self.coupling = w, coupling
-        lifted = self.inverse @ coupling.transpose(0, 2, 1)  # (P, 3, 3), by point and number
+        lifted = self.inverse @ coupling.transpose(0, 2, 1)  # (P, 3, 4), by point and number
         free = problem.view > 0
         np.subtract.at(border, problem.view[free] - 1, (w @ lifted[problem.owner])[free])
-        self.border = border.reshape(-1, 3)
+        self.border = border.reshape(-1, 4)
         self.solved = self.poses.solve(self.border)
-        own[range(3), range(3)] += damping * np.diag(own) + 1e-9 + 1.0 / problem.prior**2
+        own[range(4), range(4)] += damping * np.diag(own) + 1e-9 + 1.0 / problem.prior**2
         own -= np.einsum("pij,pjk->ik", coupling, lifted)
         self.corner = np.linalg.inv(own - self.border.T @ self.solved)
         self.pull -= np.einsum("pji,pj->i", lifted, self.by_points)
 
     def step(self, prior: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Steps of the poses (V - 1, 6), the numbers (3,) and the points (P, 3); prior (3,): its gradient."""
+        """Steps of the poses (V - 1, 6), the numbers (4,) and the points (P, 3); prior (4,): its gradient."""
         numbers = self.corner @ (self.pull + prior - self.solved.T @ self.gradient.ravel())
         poses = self.poses.solve(self.gradient.ravel()) - self.solved @ numbers
         return poses.reshape(-1, 6), numbers, self.moves(self.by_points, poses, numbers)
 
     def moves(self, by_points: FloatArray, poses: FloatArray, numbers: FloatArray) -> FloatArray:
-        """(P, 3) moves of the points that go with those of the poses (6 (V - 1),) and the numbers (3,)."""
+        """(P, 3) moves of the points that go with those of the poses (6 (V - 1),) and the numbers (4,)."""
         rest = by_points - np.einsum("pji,j->pi", self.coupling, numbers)
         start, view = self.problem.start, self.problem.view
         return moves_of_points(poses.reshape(-1, 6), rest, self.by_pose, self.inverse, start, view, self.index)
 
 
 def refine(
-    model: SparseModel, keyframes: Mapping[int, Keyframe], told: Camera, config: CalibrationConfig
+    model: SparseModel, keyframes: Mapping[int, Keyframe], told: Priors, motions: Mapping[int, RowMotion]
 ) -> Refinement | None:
-    """The camera refined on a model's observations; None where the data do not tell it from the one in use.
+    """The camera refined on a model's observations; None where there are too few.
+
+    The read-out changes only where the images contradict the one in use, and takes the camera with it only where that
+    is contradicted, too: each explains a part of what the other does.
 
     Args:
         model: adjusted views of one camera.
         keyframes: at least those of the model's views, by stamp; all have the camera in use.
-        told: the calibration, to which the priors of `config` apply.
-        config: standard deviations of the calibration.
+        told: what was told of the camera.
+        motions: of the views while their rows are read out with the read-out in use, by stamp; a view without one tells
+            nothing of the read-out.
     """
     camera = keyframes[model.stamps[0]].camera
     chosen = _sample(model)
     if chosen is None:
         return None
-    prior = np.array([config.focal_sigma, config.distortion_sigma, K2_SHARE * config.distortion_sigma])
-    offset = numbers_of(told) - numbers_of(camera)  # the prior's centre, from the camera in use
-    free: NDArray[np.bool_] = np.ones(3, bool)
+    rates = readout_rates(model, keyframes, motions, chosen[2])
+    readout = next((motion.readout for motion in motions.values()), told.readout)
+    offset = np.append(numbers_of(told.camera) - numbers_of(camera), told.readout - readout)  # the priors' centre
+    free = told.sigmas > 0
+    readout_sigma = 0.0
+    if free[3]:
+        problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD))
+        change, readout_sigma = _readout_change(problem, model, np.where(free, offset, 0.0))
+        least = READOUT_SHARE * readout if readout else LEAST_READOUT
+        free[3] = readout + change > 0 and abs(change) > max(SIGNIFICANT * readout_sigma, least)
+        if free[3] and not readout:  # what a rolling shutter bends looks like distortion: the camera's turn comes next
+            free[:3] = False
+    state, sigmas = _State(model.rotation, model.translation, model.points, np.zeros(4)), told.sigmas
     while free.any():
-        held = np.where(free, prior, 1e-9)
-        problem = _Problem(model, camera, chosen, held)
+        problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD))
         state, sigmas = _adjusted(problem, model, np.where(free, offset, 0.0))
-        determined = free & (sigmas < DETERMINED * prior)
+        determined = free & (sigmas < DETERMINED * told.sigmas)
+        if determined[3] and not (np.abs(state.numbers) > SIGNIFICANT * sigmas)[:3].any():
+            determined[:3] = False
         if (determined == free).all():
             break
         free = determined
-    if not free.any():
-        return None
-    found = changed(camera, state.numbers)
+    found = changed(camera, state.numbers) if free[:3].any() else camera
     poses = np.tile(np.eye(4), (len(model), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = state.rotation, state.translation
-    by_stamp = dict(zip(model.stamps, poses, strict=True))
-    kept = np.where(free, sigmas, np.inf)
-    return Refinement(camera, found, state.numbers, kept, largest_shift(camera, found), by_stamp)
+    numbers = np.where(free, state.numbers, 0.0)
+    rolled = abs(numbers[3]) * float(np.linalg.norm(rates, axis=1).max(initial=0.0))
+    return Refinement(
+        told=camera,
+        camera=found,
+        readout=max(readout + float(numbers[3]), 0.0),
+        readout_sigma=float(sigmas[3]) if free[3] else readout_sigma,
+        changes=numbers,
+        sigmas=np.where(free, sigmas, np.inf),
+        shift=max(largest_shift(camera, found), rolled),
+        poses=dict(zip(model.stamps, poses, strict=True)),
+    )
 
 
 def numbers_of(camera: Camera) -> FloatArray:
@@ -218,7 +274,7 @@ def numbers_of(camera: Camera) -> FloatArray:
 
 
 def changed(camera: Camera, numbers: FloatArray) -> Camera:
-    """The camera with its log focal length, k1 and k2 changed by (3,) numbers."""
+    """The camera with its log focal length, k1 and k2 changed by the first three numbers."""
     known = camera.distortion or (0.0, 0.0, 0.0, 0.0)
     factor = float(np.exp(numbers[0]))
     coefficients = (known[0] + float(numbers[1]), known[1] + float(numbers[2]), *known[2:])
@@ -271,11 +327,11 @@ def _sample(model: SparseModel) -> tuple[IntArray, IntArray, IntArray] | None:
 
 
 def _adjusted(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[_State, FloatArray]:
-    """The adjusted state, and the (3,) standard deviations of its numbers with the prior.
+    """The adjusted state, and the (4,) standard deviations of its numbers with the prior.
 
-    told (3,): the prior's centre, as a change of the camera in use.
+    told (4,): the prior's centre, as a change of the camera in use.
     """
-    state = _State(model.rotation.copy(), model.translation.copy(), model.points[problem.ids], np.zeros(3))
+    state = _State(model.rotation.copy(), model.translation.copy(), model.points[problem.ids], np.zeros(4))
     cost, damping = problem.cost(state, told), 1e-4
     for _ in range(MAX_ITERATIONS):
         rows = problem.linearised(state)
@@ -296,6 +352,14 @@ def _adjusted(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[
     return state, _sigmas(problem, state, problem.linearised(state))
 
 
+def _readout_change(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[float, float]:
+    """What one Gauss-Newton step of all numbers makes of the read-out, s, and its standard deviation; told as above."""
+    state = _State(model.rotation, model.translation, model.points[problem.ids], np.zeros(4))
+    rows = problem.linearised(state)
+    numbers = _Reduced(problem, state, rows, 0.0).step(told / problem.prior**2)[1]
+    return float(numbers[3]), float(_sigmas(problem, state, rows)[3])
+
+
 def _moved(state: _State, poses: FloatArray, numbers: FloatArray, moves: FloatArray) -> _State:
     rotation, translation = state.rotation.copy(), state.translation.copy()
     rotation[1:] = rotation_from_vector(poses[:, :3]) @ rotation[1:]
@@ -304,7 +368,7 @@ def _moved(state: _State, poses: FloatArray, numbers: FloatArray, moves: FloatAr
 
 
 def _sigmas(problem: _Problem, state: _State, rows: _Rows) -> FloatArray:
-    """(3,) standard deviations of the numbers: errors of points independent (sandwich covariance), with the prior.
+    """(4,) standard deviations of the numbers: errors of points independent (sandwich covariance), with the prior.
 
     As `function_covariance` of the bundle adjustment.
     """
@@ -312,10 +376,10 @@ def _sigmas(problem: _Problem, state: _State, rows: _Rows) -> FloatArray:
     poses = -reduced.solved @ reduced.corner
     none = np.zeros((len(problem.ids), 3))
     moves = np.stack([reduced.moves(none, *each) for each in zip(poses.T, reduced.corner, strict=True)], axis=-1)
-    turned = np.concatenate([np.zeros((1, 6, 3)), poses.reshape(-1, 6, 3)])  # the first view stays
+    turned = np.concatenate([np.zeros((1, 6, 4)), poses.reshape(-1, 6, 4)])  # the first view stays
     lines = rows.by_pose @ turned[problem.view] + rows.by_number @ reduced.corner + rows.by_point @ moves[problem.owner]
     scores = np.add.reduceat(np.einsum("kin,ki->kn", lines, rows.residuals), problem.start[:-1], axis=0)
-    observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + 6 * len(state.rotation) + 3 - 6
+    observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + 6 * len(state.rotation) + 4 - 6
     spread = np.diag(scores.T @ scores) * observed / max(observed - unknown, 1)
     by_prior = (reduced.corner / problem.prior[:, None]) ** 2
     return np.sqrt(spread + by_prior.sum(axis=0))
@@ -326,14 +390,14 @@ def _normal_equations(by_pose, by_number, by_point, residuals, start, view, coun
     """Blocks of the normal equations, and the descent gradients, of poses, points and camera, and what couples them.
 
     In the order of `eliminate_points`: poses (count, 6, 6), (count, 6), points (P, 3, 3), (P, 3), pose with point
-    (K, 6, 3); then camera (3, 3), (3,), pose with camera (count, 6, 3), camera with point (P, 3, 3).
+    (K, 6, 3); then camera (4, 4), (4,), pose with camera (count, 6, 4), camera with point (P, 4, 3).
     """
     points = len(start) - 1
     u, gu = np.zeros((count, 6, 6)), np.zeros((count, 6))
     v, gv = np.zeros((points, 3, 3)), np.zeros((points, 3))
     w = np.zeros((len(view), 6, 3))
-    c, gc = np.zeros((3, 3)), np.zeros(3)
-    uc, cv = np.zeros((count, 6, 3)), np.zeros((points, 3, 3))
+    c, gc = np.zeros((4, 4)), np.zeros(4)
+    uc, cv = np.zeros((count, 6, 4)), np.zeros((points, 4, 3))
     for p in range(points):
         for k in range(start[p], start[p + 1]):
             n = view[k] - 1
@@ -342,10 +406,13 @@ def _normal_equations(by_pose, by_number, by_point, residuals, start, view, coun
                 pose, number, point = by_pose[k, r], by_number[k, r], by_point[k, r]
                 for i in range(3):
                     gv[p, i] -= point[i] * error
-                    gc[i] -= number[i] * error
                     for j in range(3):
                         v[p, i, j] += point[i] * point[j]
+                for i in range(4):
+                    gc[i] -= number[i] * error
+                    for j in range(4):
                         c[i, j] += number[i] * number[j]
+                    for j in range(3):
                         cv[p, i, j] += number[i] * point[j]
                 if n < 0:
                     continue
@@ -355,6 +422,7 @@ def _normal_equations(by_pose, by_number, by_point, residuals, start, view, coun
                         u[n, i, j] += pose[i] * pose[j]
                     for j in range(3):
                         w[k, i, j] += pose[i] * point[j]
+                    for j in range(4):
                         uc[n, i, j] += pose[i] * number[j]
     return u, gu, v, gv, w, c, gc, uc, cv
 

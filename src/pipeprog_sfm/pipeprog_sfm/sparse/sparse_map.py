@@ -101,13 +101,14 @@ class SparseMap:
         self.revision += 1
 
     def replace_camera(self, told: Camera, camera: Camera) -> None:
-        """Gives all keyframes of one calibration another one; points and poses are adjusted."""
+        """Gives all keyframes of one calibration another one, or the same; points and poses are adjusted."""
         for stamp, keyframe in self.keyframes.items():
-            if keyframe.camera == told:
+            if keyframe.camera == told != camera:
                 self.keyframes[stamp] = keyframe.with_camera(camera)
         for model in self.models:
             for view, stamp in enumerate(model.stamps):
                 model.replace_camera(view, self.keyframes[stamp].rays, self.keyframes[stamp].focal)
+            unroll(model, self.keyframes, self.motions(model))
             adjust_points(model)
             self.adjust_globally(model)
             # Tracks that the wrong camera had cut or kept apart.
@@ -115,9 +116,13 @@ class SparseMap:
                 link(model, view, self.keyframes)
             self.adjust_globally(model)
 
-    def motions(self, model: SparseModel) -> dict[int, RowMotion]:
-        """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout."""
-        return row_motions(model, self.keyframes, self.readout) if self.readout else {}
+    def motions(self, model: SparseModel, readout: float | None = None) -> dict[int, RowMotion]:
+        """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout.
+
+        readout: s, another one than the map's.
+        """
+        readout = self.readout if readout is None else readout
+        return row_motions(model, self.keyframes, readout) if readout else {}
 
     def _adjust_rolling(self, model: SparseModel) -> None:
         """Finds the shifts of features and the poses in turns, until the shifts stay."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,12 @@ from scenes import CAMERA, STEP, pose, position_errors, view
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.sparse.mapper import Mapper
+from pipeprog_sfm.sparse.self_calibration import Priors
 
 READOUT = 0.03  # s
 SPEED = 0.8  # m/s
 TICK = 1e-4  # s of numerical derivatives
+UNKNOWN = Priors(CAMERA, 0.0, np.array([0.003, 0.005, 0.01, 0.03]))
 
 
 def camera_at(time: float) -> NDArray[np.float64]:
@@ -58,10 +61,39 @@ def test_the_path_is_that_of_a_global_shutter(told: tuple[Mapper, dict[int, NDAr
     assert 0.25 < mapper.map.reprojection_error() < 0.45
 
 
-def test_without_the_readout_the_path_is_bent() -> None:
-    mapper, truth = walk(0.0)
+@pytest.fixture(scope="module")
+def not_told() -> tuple[Mapper, dict[int, NDArray[Any]]]:
+    return walk(0.0)
+
+
+def test_without_the_readout_the_path_is_bent(not_told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    mapper, truth = not_told
     assert position_errors(mapper.map.camera_from_model(), truth).max() > 5e-3
     assert mapper.map.motions(mapper.map.published) == {}
+
+
+def test_a_readout_that_is_not_told_is_found(not_told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    mapper, truth = copy.deepcopy(not_told)
+    found = mapper.self_calibration(UNKNOWN)
+    assert found is not None
+    assert found.is_significant
+    assert found.camera == CAMERA
+    # Nine views of a sway whose spline knows the velocities to 3 %, those of the ends to 10 %.
+    assert found.readout == pytest.approx(READOUT, rel=0.05)
+    mapper.take_camera(found)
+    assert mapper.map.readout == found.readout
+    assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
+
+
+def test_a_global_shutter_stays_one() -> None:
+    mapper = Mapper(MapperConfig())
+    for n in range(7):
+        mapper.add_features(n * STEP, view(camera_at(n * STEP * 1e-9), n), CAMERA)
+    mapper.finish()
+    found = mapper.self_calibration(UNKNOWN)
+    assert found is not None
+    assert found.readout == 0.0
+    assert found.readout_sigma < 0.001
 
 
 def test_velocities_are_those_of_the_walk(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.config import CalibrationConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.sparse.model_adjustment import adjust_model
-from pipeprog_sfm.sparse.self_calibration import refine
+from pipeprog_sfm.sparse.self_calibration import Priors, refine
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 TRUE = Camera(848, 480, 600.0, 600.0, 423.5, 239.5, "plumb_bob", (0.0, 0.0, 0.0, 0.0))
 NOISE = 0.2  # px
+SIGMAS = np.array([0.003, 0.005, 0.01, 0.0])  # of a calibration; a global shutter
 
 
 def survey(true: Camera, told: Camera, views: int = 14, points: int = 700) -> tuple[SparseModel, dict[int, Keyframe]]:
@@ -51,7 +51,7 @@ def survey(true: Camera, told: Camera, views: int = 14, points: int = 700) -> tu
 )
 def test_a_wrong_calibration_is_found(focal_error: float, k1: float) -> None:
     told = replace(TRUE, fx=TRUE.fx * (1 + focal_error), fy=TRUE.fy * (1 + focal_error), distortion=(k1, 0.0, 0.0, 0.0))
-    found = refine(*survey(TRUE, told), told, CalibrationConfig())
+    found = refine(*survey(TRUE, told), Priors(told, 0.0, SIGMAS), {})
     assert found is not None
     assert found.is_significant
     assert found.told == told
@@ -60,5 +60,6 @@ def test_a_wrong_calibration_is_found(focal_error: float, k1: float) -> None:
 
 
 def test_a_right_calibration_stays() -> None:
-    found = refine(*survey(TRUE, TRUE), TRUE, CalibrationConfig())
-    assert found is None or not found.is_significant
+    found = refine(*survey(TRUE, TRUE), Priors(TRUE, 0.0, SIGMAS), {})
+    assert found is not None
+    assert not found.is_significant
