@@ -21,6 +21,7 @@ from rich.progress import track
 from sitegen.field import build_field
 from sitegen.lab import build_lab
 from sitegen.night import second_night
+from sitegen.rack import build_rack
 from sitegen.recording import (
     FIRST_STAMP,
     camera_info,
@@ -53,6 +54,10 @@ class Layout(str, Enum):
 
     lab = "lab"
     field = "field"
+    rack = "rack"
+
+
+_BUILDERS = {Layout.lab: build_lab, Layout.field: build_field, Layout.rack: build_rack}
 
 
 class Size(str, Enum):
@@ -66,12 +71,12 @@ class Size(str, Enum):
 
 @app.command()
 def make_site(
-    layout: Annotated[Layout, typer.Argument(help="lab: six pipes in a room corner; field: 58 in a plant room")],
+    layout: Annotated[Layout, typer.Argument(help="lab: 6 pipes in a corner; field: 58; rack: of many materials")],
     out: Annotated[Path, typer.Argument(help="NAME.mcap; NAME.truth.json, .boq.yaml and .board.yaml go beside it")],
     seed: Annotated[int, typer.Option(help="layout, textures, hand and noise")] = 1,
     size: Annotated[Size, typer.Option(help="image size")] = Size.p720,
     fps: Annotated[float, typer.Option(help="frames per second", min=0.1)] = 5.0,
-    seconds: Annotated[float | None, typer.Option(help="duration; lab: 16, field: the whole walk")] = None,
+    seconds: Annotated[float | None, typer.Option(help="duration; field: the whole walk, else 16")] = None,
     speed: Annotated[float, typer.Option(help="walking speed, m/s", min=0.01)] = 0.75,
     distance: Annotated[float, typer.Option(help="from the wall, m", min=0.5, max=4.0)] = 2.0,
     wobble: Annotated[float, typer.Option(help="unsteadiness of the hand: 0 a rail, 1 a careful person", min=0)] = 1.0,
@@ -99,7 +104,7 @@ def make_site(
     console = Console(stderr=True)
     lens = lens_of(size, distortion)
     rng = np.random.default_rng(seed)
-    build = build_lab if layout == Layout.lab else build_field
+    build = _BUILDERS[layout]
     try:
         site = build(rng, richness, tiled, distance, board_error_mm / 1e3)
         if second_night_later:
@@ -108,10 +113,10 @@ def make_site(
     except RuntimeError as error:
         console.print(f"error: {error}")
         raise typer.Exit(1) from None
-    scene = build_scene(site.primitives, site.lamps, site.ambient, seed)
+    scene = build_scene(site.primitives, site.lamps, site.ambient, seed, site.ambient_colour)
     walk = Walk(site.waypoints, speed, rng, site.closed_walk, wobble)
     if seconds is None:
-        seconds = _LAB_SECONDS if layout == Layout.lab else walk.duration
+        seconds = walk.duration if layout == Layout.field else _LAB_SECONDS
     times = np.arange(max(math.floor(seconds * fps), 1)) / fps
     poses = walk.poses(times)
 
@@ -129,7 +134,7 @@ def make_site(
         points, owners = visible_surface(scene, preview, poses[:: max(len(poses) // _SURFACE_VIEWS, 1)])
         np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
     # The recording is written last: where it exists, all files that belong to it exist, too.
-    sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain)
+    sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain, site.balance)
     frames = _frames(Shot(scene, lens, walk, sensor), times, seed + _NIGHT_SEED * second_night_later, jobs)
     motion_rng = np.random.default_rng([seed, _MOTION_SEED])
     motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng)

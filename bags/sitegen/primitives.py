@@ -33,7 +33,8 @@ class Material:
     """A solid texture and how it takes light; colours are linear, lengths in metres.
 
     `mottle` and `speckle` are relative changes of the albedo, `cell` the size of the coarsest mottle, `stretch`
-    lengthens the texture along the local z axis (brushed or drawn metal).
+    lengthens the texture along the local z axis (brushed or drawn metal). `mirror` is the share of the room's light
+    that it mirrors when seen face on, `metal` how much what it mirrors takes its colour (0: dielectric, 1: metal).
     """
 
     name: str
@@ -48,6 +49,8 @@ class Material:
     specular: float = 0.0
     shininess: float = 20.0
     period: float = 0.0
+    mirror: float = 0.0
+    metal: float = 0.0
 
     def row(self) -> list[float]:
         """The material as the renderer's flat row."""
@@ -63,6 +66,8 @@ class Material:
             self.specular,
             self.shininess,
             self.period,
+            self.mirror,
+            self.metal,
         ]
 
 

@@ -155,11 +155,11 @@ def write_truth(path: Path, values: dict[str, Any]) -> None:
 def write_boq(path: Path, site: Site) -> None:
     """Write the bill of quantities."""
     lines = ["classes:"]
-    for radius, metres in site.planned_lengths().items():
+    for (radius, material), metres in site.planned_lengths().items():
         name, colour = CLASSES[radius]
-        lines.append(
-            f"  - {{name: {name}, outer_radius_mm: {radius * 1e3:g}, planned_length_m: {metres}, color: {colour}}}"
-        )
+        size = f"outer_radius_mm: {radius * 1e3:g}, planned_length_m: {metres}"
+        told = f"{{name: {name} {material}, {size}, material: {material}}}" if material else ""
+        lines.append(f"  - {told or f'{{name: {name}, {size}, color: {colour}}}'}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

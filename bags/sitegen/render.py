@@ -13,13 +13,19 @@ from numpy.typing import NDArray
 
 from sitegen.primitives import Material, Primitive
 from sitegen.raycast import STACK, Hit, IntArray, PackedTree, Tree, blocked, build_tree, nearest
-from sitegen.textures import albedo_factor
+from sitegen.textures import albedo_factor, value_noise
 
 FloatArray = NDArray[np.float64]
 FloatImage = NDArray[np.float32]
 
+Colour = tuple[float, float, float]  # linear
+NEUTRAL: Colour = (1.0, 1.0, 1.0)
+
 _EDGE_BITS = 4  # sixteen rays
 _BORE = 0.9  # inner over outer radius, as the end of a pipe shows it
+# What is mirrored: a room whose surfaces give back this share of its light, more above than below, and unevenly, with
+# this many lighter and darker places about the horizon; this share of a lamp's light falls on it.
+_ROOM, _ABOVE, _UNEVEN, _PLACES, _LIT = 0.5, 0.35, 0.7, 2.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,7 @@ class Lamp:
 
     position: tuple[float, float, float]
     power: float
+    colour: Colour = NEUTRAL
 
 
 @dataclass(frozen=True)
@@ -64,14 +71,16 @@ class Scene:
     """Everything the renderer needs, in flat arrays."""
 
     tree: Tree
-    materials: FloatArray  # (P, 13), one row per primitive
+    materials: FloatArray  # (P, 15), one row per primitive
     seeds: IntArray  # (P,)
     pipes: IntArray  # (P,) index of the true pipe or -1
-    lamps: FloatArray  # (L, 4) position and power
-    ambient: float
+    lamps: FloatArray  # (L, 7) position, power and colour
+    ambient: FloatArray  # (3,)
 
 
-def build_scene(primitives: Sequence[Primitive], lamps: Sequence[Lamp], ambient: float, seed: int) -> Scene:
+def build_scene(
+    primitives: Sequence[Primitive], lamps: Sequence[Lamp], ambient: float, seed: int, ambient_colour: Colour = NEUTRAL
+) -> Scene:
     """Pack primitives and lamps; every primitive gets a texture seed of its own."""
     materials: list[Material] = [p.material for p in primitives]
     return Scene(
@@ -79,8 +88,8 @@ def build_scene(primitives: Sequence[Primitive], lamps: Sequence[Lamp], ambient:
         np.array([m.row() for m in materials]),
         np.array([1000 * seed + 7919 * k for k in range(len(primitives))], np.int64) % 2**31,
         np.array([p.pipe for p in primitives], np.int64),
-        np.array([[*lamp.position, lamp.power] for lamp in lamps], float).reshape(-1, 4),
-        ambient,
+        np.array([[*lamp.position, lamp.power, *lamp.colour] for lamp in lamps], float).reshape(-1, 7),
+        ambient * np.array(ambient_colour),
     )
 
 
@@ -145,7 +154,7 @@ def _shade(
     materials: FloatArray,
     seeds: IntArray,
     lamps: FloatArray,
-    ambient: float,
+    ambient: FloatArray,
     pose: FloatArray,
     lens: FloatArray,
     u: float,
@@ -156,8 +165,8 @@ def _shade(
     kinds, geometry = tree[0], tree[1]
     p, hit, dx, dy, dz = _cast(tree, pose, lens, u, v, stack)
     if p < 0:
-        sky = 0.25 + 0.05 * dz
-        return sky, sky, sky, -1
+        far = 0.25 + 0.05 * dz
+        return far, far, far, -1
     t, x, y, z, lx, ly, lz, part = hit
     g = geometry[p]
     material = materials[p]
@@ -173,8 +182,10 @@ def _shade(
         part = 2
     wx, wy, wz = pose[0, 3] + t * dx, pose[1, 3] + t * dy, pose[2, 3] + t * dz
     ox, oy, oz = wx + 1e-5 * nx, wy + 1e-5 * ny, wz + 1e-5 * nz
-    diffuse = ambient * (0.8 + 0.2 * nz)
-    gloss = 0.0
+    sky = 0.8 + 0.2 * nz
+    red, green, blue = ambient[0] * sky, ambient[1] * sky, ambient[2] * sky
+    shine_red, shine_green, shine_blue = 0.0, 0.0, 0.0
+    room_red, room_green, room_blue = ambient[0], ambient[1], ambient[2]
     shadows = 0
     for k in range(len(lamps)):
         sx, sy, sz = lamps[k, 0] - wx, lamps[k, 1] - wy, lamps[k, 2] - wz
@@ -182,22 +193,43 @@ def _shade(
         d = math.sqrt(d2)
         sx, sy, sz = sx / d, sy / d, sz / d
         cosine = nx * sx + ny * sy + nz * sz
+        spread = _LIT * lamps[k, 3] / (1.0 + d2)
+        room_red, room_green = room_red + spread * lamps[k, 4], room_green + spread * lamps[k, 5]
+        room_blue = room_blue + spread * lamps[k, 6]
         if cosine <= 0.0:
             continue
         if blocked(tree, stack, (ox, oy, oz, sx, sy, sz), d):
             shadows |= 1 << k
             continue
         power = lamps[k, 3] / d2
-        diffuse += power * cosine
+        light = power * cosine
+        red, green, blue = red + light * lamps[k, 4], green + light * lamps[k, 5], blue + light * lamps[k, 6]
         if material[10] > 0.0:
             hx, hy, hz = sx - dx, sy - dy, sz - dz
             h = math.sqrt(hx * hx + hy * hy + hz * hz)
             peak = max((nx * hx + ny * hy + nz * hz) / h, 0.0)
-            gloss += power * material[10] * peak ** material[11]
-    gloss *= factor
-    diffuse *= factor
+            gloss = power * material[10] * peak ** material[11]
+            shine_red, shine_green = shine_red + gloss * lamps[k, 4], shine_green + gloss * lamps[k, 5]
+            shine_blue = shine_blue + gloss * lamps[k, 6]
+    if material[13] > 0.0:
+        mx, my, mz = dx + 2.0 * facing * nx, dy + 2.0 * facing * ny, dz + 2.0 * facing * nz
+        share = material[13] + (1.0 - material[13]) * max(1.0 - facing, 0.0) ** 5
+        uneven = value_noise(_PLACES * mx, _PLACES * my, _PLACES * mz, 0, seeds[0])
+        share *= _ROOM * max(1.0 + _ABOVE * mz + _UNEVEN * uneven, 0.1)
+        shine_red, shine_green = shine_red + share * room_red, shine_green + share * room_green
+        shine_blue = shine_blue + share * room_blue
+    if material[14] > 0.0:
+        brightest, metal = max(material[0], material[1], material[2]), material[14]
+        shine_red *= 1.0 - metal + metal * material[0] / brightest
+        shine_green *= 1.0 - metal + metal * material[1] / brightest
+        shine_blue *= 1.0 - metal + metal * material[2] / brightest
     label = ((p * 8 + part) << 8) | shadows
-    return material[0] * diffuse + gloss, material[1] * diffuse + gloss, material[2] * diffuse + gloss, label
+    return (
+        material[0] * (red * factor) + shine_red * factor,
+        material[1] * (green * factor) + shine_green * factor,
+        material[2] * (blue * factor) + shine_blue * factor,
+        label,
+    )
 
 
 @njit(nogil=True)
@@ -206,7 +238,7 @@ def _render(
     materials: FloatArray,
     seeds: IntArray,
     lamps: FloatArray,
-    ambient: float,
+    ambient: FloatArray,
     poses: FloatArray,
     lens: FloatArray,
     pattern: FloatArray,
@@ -281,6 +313,34 @@ def render(scene: Scene, lens: Lens, row_poses: FloatArray, edge_bits: int = _ED
         labels,
     )
     return image
+
+
+@njit(nogil=True)
+def _shade_pixels(
+    tree: PackedTree,
+    materials: FloatArray,
+    seeds: IntArray,
+    lamps: FloatArray,
+    ambient: FloatArray,
+    pose: FloatArray,
+    lens: FloatArray,
+    pixels: FloatArray,
+) -> FloatArray:
+    stack = np.empty(STACK, np.int64)
+    light = np.empty((len(pixels), 3))
+    for k in range(len(pixels)):
+        u, v = pixels[k]
+        light[k, 0], light[k, 1], light[k, 2], _ = _shade(
+            tree, materials, seeds, lamps, ambient, pose, lens, u, v, stack
+        )
+    return light
+
+
+def light_at(scene: Scene, lens: Lens, pose: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Linear RGB (N, 3) where single rays through pixels (N, 2) of a camera at world_from_camera (4, 4) end."""
+    packed, top = scene.tree.packed(), np.ascontiguousarray(pose[:3])
+    lit = scene.materials, scene.seeds, scene.lamps, scene.ambient
+    return _shade_pixels(packed, *lit, top, lens.row(), np.ascontiguousarray(pixels, float))
 
 
 def trace(scene: Scene, lens: Lens, pose: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:

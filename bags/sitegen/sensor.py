@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sitegen.render import FloatImage, Lens, Scene, render
+from sitegen.render import NEUTRAL, Colour, FloatImage, Lens, Scene, render
 from sitegen.walk import Walk
 
 _BLUR_STEP = 0.7  # px between the sub-frames of a blurred frame: less than the lens blur, so that no copies show
@@ -25,6 +25,7 @@ class Sensor:
     noise: float = 1.0
     quality: int = 92
     gain: float = 1.0
+    balance: Colour = NEUTRAL  # factors on red, green and blue
 
 
 def expose(scene: Scene, lens: Lens, walk: Walk, sensor: Sensor, time: float) -> FloatImage:
@@ -51,15 +52,19 @@ def develop(linear: FloatImage, sensor: Sensor, rng: np.random.Generator) -> NDA
 
     The noise is the same at all grey levels: photon noise grows with the root of the light, and the curve nearly does.
     """
-    image = linear * np.float32(sensor.gain)
+    image = linear * (np.float32(sensor.gain) * np.asarray(sensor.balance, np.float32))
     if sensor.blur > 0.0:
         image = cv2.GaussianBlur(image, (0, 0), sensor.blur)
-    image = np.clip(image, 0.0, 1.0)
-    curve = np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** np.float32(1 / 2.4) - 0.055)
-    levels = 255.0 * curve[:, :, ::-1]
+    levels = grey_levels(image)[:, :, ::-1]
     if sensor.noise > 0.0:
         levels = levels + sensor.noise * rng.standard_normal(levels.shape, np.float32)
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def grey_levels(light: FloatImage) -> FloatImage:
+    """Grey levels, 0 to 255 and not rounded, of light of which 1 is white (sRGB)."""
+    light = np.clip(light, 0.0, 1.0)
+    return 255.0 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** np.float32(1 / 2.4) - 0.055)
 
 
 def compress(image: NDArray[np.uint8], sensor: Sensor) -> bytes:

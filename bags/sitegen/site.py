@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sitegen import primitives as shapes
 from sitegen.primitives import Material, Primitive, unit
-from sitegen.render import Lamp
+from sitegen.render import NEUTRAL, Colour, Lamp
 
 FloatArray = NDArray[np.float64]
 
@@ -93,9 +93,12 @@ class Site:
     boards: list[FloatArray] = field(default_factory=list)
     lamps: list[Lamp] = field(default_factory=list)
     ambient: float = 0.25
+    ambient_colour: Colour = NEUTRAL
     gain: float = 1.0
+    balance: Colour = NEUTRAL  # factors on the camera's red, green and blue
     waypoints: list[list[float]] = field(default_factory=list)
     closed_walk: bool = False
+    tells_materials: bool = False  # its bill names materials, pipes of one radius have several
 
     def dressed(self, material: Material, wall: bool = False) -> Material:
         """The material with as much texture as this site has, repeating on walls where asked."""
@@ -177,12 +180,24 @@ class Site:
             p = (1 - s) * np.asarray(start, float) + s * np.asarray(end, float)
             self.lamps.append(Lamp((float(p[0]), float(p[1]), float(p[2])), power / points))
 
-    def planned_lengths(self) -> dict[float, float]:
-        """Radius -> planned metres: a quarter more than is installed, to the decimetre."""
-        return {
-            radius: round(1.25 * sum(p.length for p in [*self.pipes, *self.removed] if p.radius == radius), 1)
-            for radius in self.planned_radii
-        }
+    def planned_lengths(self) -> dict[tuple[float, str], float]:
+        """(radius, material) -> planned metres: a quarter more than is installed, to the decimetre.
+
+        The material is empty where the bill does not tell it.
+        """
+        keys = [(radius, material) for radius in self.planned_radii for material in self._materials(radius)]
+        return {key: round(1.25 * sum(p.length for p in self._all if self._line(p) == key), 1) for key in keys}
+
+    @property
+    def _all(self) -> list[Pipe]:
+        return [*self.pipes, *self.removed]
+
+    def _materials(self, radius: float) -> list[str]:
+        own = (self._line(pipe)[1] for pipe in self._all if pipe.radius == radius)
+        return list(dict.fromkeys(own)) or [""]
+
+    def _line(self, pipe: Pipe) -> tuple[float, str]:
+        return pipe.radius, pipe.material if self.tells_materials else ""
 
 
 def segment_gap(a0: FloatArray, a1: FloatArray, b0: FloatArray, b1: FloatArray) -> float:

@@ -78,7 +78,7 @@ def test_boards_are_printed_as_badly_as_asked_and_nothing_else_moves() -> None:
 def test_a_boq_plans_a_quarter_more_than_is_there() -> None:
     site = lab(1)
     planned = site.planned_lengths()
-    assert list(planned) == list(LAB_RADII)
+    assert list(planned) == [(radius, "") for radius in LAB_RADII]
     assert sum(planned.values()) == pytest.approx(1.25 * sum(p.length for p in site.pipes), abs=0.05 * len(planned))
 
 
