@@ -64,7 +64,8 @@ def develop(linear: FloatImage, sensor: Sensor, rng: np.random.Generator) -> NDA
 def grey_levels(light: FloatImage) -> FloatImage:
     """Grey levels, 0 to 255 and not rounded, of light of which 1 is white (sRGB)."""
     light = np.clip(light, 0.0, 1.0)
-    return 255.0 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** np.float32(1 / 2.4) - 0.055)
+    curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** np.float32(1 / 2.4) - 0.055)
+    return np.asarray(255.0 * curve, np.float32)
 
 
 def compress(image: NDArray[np.uint8], sensor: Sensor) -> bytes:

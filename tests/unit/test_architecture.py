@@ -69,6 +69,7 @@ FOLDERS = {
         "verification": {"cloud", "silhouette", "product"},
         "thin": {"cloud", "silhouette", "product", "verification"},
         "coverage": {"cloud", "silhouette", "product", "thin"},
+        "look": {"silhouette", "product"},
     },
     "pipeprog_bringup": {
         "recording": set(),

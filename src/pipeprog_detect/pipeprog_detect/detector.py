@@ -167,7 +167,7 @@ def _candidates(
 ) -> list[Candidate]:
     """The candidates of the cloud; of a map that follows another one, those of the last map and of what is new."""
     tree, shift = prepared.tree, prepared.shift
-    planned = [each.outer_radius for each in boq.classes]
+    planned = list(boq.radii)
     radius_range = (config.radius_min, _THICKEST * max(planned))
     criteria = seen_from_outside(_noise_on_pipes(prepared, verifier), config)
     search = Search(tree, prepared.around, criteria, radius_range, planned, config, verifier, report)

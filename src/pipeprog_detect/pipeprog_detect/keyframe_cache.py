@@ -54,6 +54,10 @@ class Keyframes:
         """The calibration of a keyframe."""
         return self._encoded[stamp][1]
 
+    def colour(self, stamp: int) -> NDArray[np.uint8]:
+        """The keyframe (H, W, 3) in blue, green and red, undistorted; `view` has shown that it can be decoded."""
+        return _decoded(stamp, *self._encoded[stamp], cv2.IMREAD_COLOR)
+
     def view(self, stamp: int, map_from_camera: FloatArray) -> View:
         """The keyframe at its pose (4, 4); raises InputError where it cannot be decoded."""
         encoded, camera = self._encoded[stamp]
@@ -67,14 +71,14 @@ class Keyframes:
         return View(stamp, image, camera.pinhole(), np.linalg.inv(map_from_camera).astype(float))
 
 
-def _decoded(stamp: int, encoded: bytes, camera: Camera) -> NDArray[np.uint8]:
+def _decoded(stamp: int, encoded: bytes, camera: Camera, mode: int = cv2.IMREAD_GRAYSCALE) -> NDArray[np.uint8]:
     try:
-        image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(np.frombuffer(encoded, np.uint8), mode)
     except cv2.error:  # some damaged headers; for other damage it returns None
         image = None
     if image is None:
         raise InputError(f"the keyframe at {stamp} ns cannot be decoded")
-    if image.shape != (camera.height, camera.width):
+    if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"the keyframe at {stamp} ns has {image.shape[1]} x {image.shape[0]} pixels, its CameraInfo says "
             f"{camera.width} x {camera.height}: calibrate at the size that the camera sends"

@@ -24,6 +24,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CLOUD_POINTS, MAX_POSES
 from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.look.colour_view import BoardCircles
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
@@ -150,6 +151,7 @@ def _map_command(whole: CompleteMap, final: bool) -> Map:
         final,
         None if camera is None else camera.camera,
         None if velocities is None else RowVelocities(velocities.readout, velocities.linear, velocities.angular),
+        BoardCircles.of(status.circles),
     )
 
 
@@ -356,6 +358,8 @@ def _pipe_msg(pipe: Pipe, product: Product) -> msg.Pipe:
         end_sigma=end.sigma,
         start_state=start.state,
         end_state=end.state,
+        material=pipe.material,
+        material_probability=pipe.material_probability,
     )
 
 

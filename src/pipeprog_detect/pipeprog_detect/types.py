@@ -160,7 +160,8 @@ class Pipe:
     """A measured and classified pipe; fields as in pipeprog_msgs/Pipe (metres, radians).
 
     `class_kmeans` depends on the radii of all pipes of a map: it is empty until these are known. `ends`: its start and
-    its end.
+    its end. `material`: what the keyframes show it to be made of, where classes of its radius differ in that; empty
+    where they do not tell, and with a probability of 0 where they were not asked.
     """
 
     id: str
@@ -173,3 +174,5 @@ class Pipe:
     points: int
     class_kmeans: str = ""
     ends: tuple[PipeEnd, PipeEnd] = (PipeEnd(), PipeEnd())
+    material: str = ""
+    material_probability: float = 0.0

@@ -16,7 +16,10 @@ from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.keyframe_cache import Keyframes
+from pipeprog_detect.look.colour_view import NO_CIRCLES, BoardCircles
+from pipeprog_detect.look.told_by_look import Seen, told_by_look
 from pipeprog_detect.product.boq import BillOfQuantities
+from pipeprog_detect.product.classification import asks_look
 from pipeprog_detect.product.pipe_tracker import PipeTracker
 from pipeprog_detect.product.product import Product, product_of
 from pipeprog_detect.types import Cloud, Cylinder, RowVelocities, View
@@ -42,6 +45,7 @@ class Map:
     """Command: detect in this map; poses (M, 4, 4) map_from_camera and velocities belong to stamps (M,).
 
     What is found in a `final` map does not depend on the maps before it. A `camera` replaces that of all keyframes.
+    `circles` of the boards tell what is white.
     """
 
     revision: int
@@ -52,6 +56,7 @@ class Map:
     final: bool
     camera: Camera | None = None
     velocities: RowVelocities | None = None
+    circles: BoardCircles = NO_CIRCLES
 
     @property
     def content(self) -> tuple[object, ...]:
@@ -127,6 +132,9 @@ def serve(
         except InputError as error:
             connection.send(NoPipes(command.revision, str(error)))
             continue
+        if any(asks_look(pipe, boq, config.concave) for pipe in pipes):
+            seen = Seen(views, keyframes.colour, command.points.astype(float), command.circles)
+            pipes = told_by_look(pipes, boq, seen, config.concave)
         connection.send(PipesReady(command.revision, product_of(identities.named(pipes), boq)))
 
 

@@ -12,6 +12,7 @@ from sensor_msgs.msg import PointCloud2
 
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import (
+    MAX_CIRCLES,
     MAX_COORDINATE,
     MAX_NAME,
     MAX_NORMAL_ERROR,
@@ -55,7 +56,10 @@ class ReceivedVelocities:
 
 @dataclass(frozen=True)
 class ReceivedStatus:
-    """Health of the reconstruction: stamp [ns] and number of its last map (0: none yet), the rest as in SfmStatus."""
+    """Health of the reconstruction: stamp [ns] and number of its last map (0: none yet), the rest as in SfmStatus.
+
+    `circles`: centre and radius (x, y, z, r) [m] of each white circle of the boards.
+    """
 
     stamp: int
     revision: int
@@ -63,6 +67,7 @@ class ReceivedStatus:
     scale_sigma: float
     readout: float = 0.0
     camera_refined: bool = False
+    circles: tuple[tuple[float, float, float, float], ...] = ()
 
 
 def map_points(message: PointCloud2) -> ReceivedCloud:
@@ -176,4 +181,17 @@ def sfm_status(message: SfmStatus) -> ReceivedStatus:
         message.scale_sigma,
         message.readout,
         message.camera_refined,
+        _circles(message),
     )
+
+
+def _circles(message: SfmStatus) -> tuple[tuple[float, float, float, float], ...]:
+    centres, radii = message.board_circles, message.board_circle_radii
+    if len(centres) != len(radii) or len(radii) > MAX_CIRCLES:
+        raise InvalidMessageError(
+            "circles", f"{len(centres)} board_circles and {len(radii)} radii: each has one, and {MAX_CIRCLES} at most"
+        )
+    rows = [(c.x, c.y, c.z, float(r)) for c, r in zip(centres, radii, strict=True)]
+    if not all(row[3] > 0.0 and all(abs(value) <= MAX_COORDINATE for value in row) for row in rows):
+        raise InvalidMessageError("circles", "a circle of board_circles is nowhere or has no radius")
+    return tuple(rows)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMsg
 from rclpy.clock import Clock, ClockType
@@ -229,6 +230,7 @@ class MapOutput:
     def publish_status(self, status: Status, stamp: int, motion_considered: int) -> None:
         """Health; stamp [ns]: of the newest keyframe."""
         scale = status.scale
+        circles = scale.board_circles if scale else np.empty((0, 4))
         self._statuses.publish(
             msg.SfmStatus(
                 header=messages.header(stamp, "map"),
@@ -247,6 +249,8 @@ class MapOutput:
                 calibration=status.calibration,
                 readout=status.readout,
                 readout_sigma=status.readout_sigma,
+                board_circles=[Point(x=x, y=y, z=z) for x, y, z in circles[:, :3].tolist()],
+                board_circle_radii=circles[:, 3].tolist(),
                 message=status.message,
             )
         )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point
 from hypothesis import given
 from hypothesis import strategies as st
 from nav_msgs.msg import Path
@@ -103,6 +104,13 @@ ROWS: list[tuple[str, Callable[[Any], object], Any]] = [
     ("read-out: below zero", received_maps.keyframe_velocities, velocities(readout=-0.01)),
     ("read-out: of no rolling shutter", received_maps.keyframe_velocities, velocities(readout=0.0)),
     ("read-out: of NaN", received_maps.sfm_status, SfmStatus(readout=np.nan)),
+    ("circles: one without radius", received_maps.sfm_status, SfmStatus(board_circles=[Point()])),
+    (
+        "circles: of NaN",
+        received_maps.sfm_status,
+        SfmStatus(board_circles=[Point(z=np.nan)], board_circle_radii=[0.04]),
+    ),
+    ("circles: of radius zero", received_maps.sfm_status, SfmStatus(board_circles=[Point()], board_circle_radii=[0.0])),
     ("image: empty", received_images.compressed_image, picture(b"")),
     ("image: not to be decoded", received_images.compressed_image, picture(b"no image")),
     ("image: over 2^30 pixels", received_images.compressed_image, picture(png_of(40_000, 40_000))),
@@ -130,6 +138,8 @@ def test_a_good_map_is_taken_as_it_is() -> None:
     assert len(received_maps.keyframe_poses(poses(0)).stamps) == 0
     status = SfmStatus(map_revision=3, map_stamp=messages.time_msg(STAMP), scale_source="board", scale_sigma=0.001)
     assert received_maps.sfm_status(status) == received_maps.ReceivedStatus(17, 3, "board", 0.001)
+    status.board_circles, status.board_circle_radii = [Point(x=1.0, y=2.0, z=3.0)], [0.04]
+    assert received_maps.sfm_status(status).circles == ((1.0, 2.0, 3.0, 0.04),)
 
 
 def test_velocities_come_as_they_were_sent() -> None:

@@ -15,13 +15,18 @@ import numpy as np
 
 from pipeprog_bringup.export.survey import Survey
 from pipeprog_bringup.export.tables import class_rows, positive
+from pipeprog_bringup.results.pipes_file import COVERAGE_KEYS
 from pipeprog_camera.outside_text import for_spreadsheet
 
-CLASS_COLUMNS = ("class", "outer_radius_um", "planned_mm", "installed_mm", "installed_sigma_um", "percent", "pipes")
+CLASS_COLUMNS = (
+    *("class", "outer_radius_um", "planned_mm", "installed_mm", "installed_sigma_um", "percent", "pipes"),
+    *("missing_mm", "unclear_mm", "hidden_mm", "not_seen_mm", "walls_seen_percent"),
+)
 PIPE_COLUMNS = (
     *("id", "class", "run", "outer_radius_um", "radius_sigma_um", "length_mm", "length_sigma_um"),
     *("start_x_mm", "start_y_mm", "start_z_mm", "end_x_mm", "end_y_mm", "end_z_mm"),
     *("class_probability_percent", "visible_arc_deg", "points"),
+    *("hidden_mm", "not_seen_mm", "material", "material_probability_percent"),
 )
 _MICRO, _MILLI, _PERCENT = 1e6, 1e3, 100.0
 
@@ -37,8 +42,10 @@ def write_classes(survey: Survey, path: Path) -> None:
             _whole(row.sigma, _MICRO),
             _whole(row.share, _PERCENT),
             str(row.pipes),
+            *(_whole(own.get(key), _MILLI) for key in COVERAGE_KEYS),
+            _whole(own.get("walls_seen_percent"), 1.0),
         ]
-        for row in class_rows(survey)
+        for row, own in zip(class_rows(survey), survey.results.classes, strict=True)
     )
     _write(path, CLASS_COLUMNS, rows)
 
@@ -58,6 +65,10 @@ def write_pipes(survey: Survey, path: Path) -> None:
             _whole(pipe.row.get("class_probability"), _PERCENT),
             _whole(pipe.row.get("visible_arc_deg"), 1.0),
             _whole(pipe.row.get("points"), 1.0),
+            _whole(pipe.row.get("hidden_m"), _MILLI),
+            _whole(pipe.row.get("not_seen_m"), _MILLI),
+            pipe.row.get("material") or "",
+            _whole(pipe.row.get("material_probability"), _PERCENT),
         ]
         for pipe in survey.pipes
     )

@@ -51,6 +51,7 @@ class BillLineRow:
     activity: str
     start: str
     finish: str
+    material: str
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def along_axis(cylinder: Cylinder, origin: FloatArray) -> FloatArray:
 
 def _line(class_name: str, line: dict[str, Any]) -> BillLineRow:
     planned = line.get("planned_length_m")
-    texts = (str(line.get(key, "")) for key in ("system", "zone", "activity", "start", "finish"))
+    texts = (str(line.get(key, "")) for key in ("system", "zone", "activity", "start", "finish", "material"))
     length = float(planned) if isinstance(planned, int | float) else 0.0
     return BillLineRow(class_name, str(line.get("name", class_name)), length, *texts)
 

@@ -38,7 +38,7 @@ _PROGRESS = (
     _Column("Standard deviation [m]", _METRES, 22),
     _Column("Installed [%]", _PERCENT, 13),
     _Column("Pipes", _WHOLE, 8),
-    *(_Column(heading) for heading in ("System", "Zone", "Activity", "Start", "Finish")),
+    *(_Column(heading) for heading in ("System", "Zone", "Activity", "Start", "Finish", "Material")),
 )
 _PIPES = (
     _Column("Pipe", width=8),
@@ -52,6 +52,8 @@ _PIPES = (
     _Column("Probability of the class", _PERCENT, 22),
     _Column("Visible arc [deg]", _WHOLE, 16),
     _Column("Points", _WHOLE),
+    _Column("Material seen", width=16),
+    _Column("Probability of the material", _PERCENT, 26),
 )
 _PLANNED = (
     _Column("Planned pipe", width=28),
@@ -120,7 +122,7 @@ def _progress_rows(survey: Survey) -> list[list[Any]]:
 
 
 def _details(line: BillLineRow) -> list[str]:
-    return [line.system, line.zone, line.activity, line.start, line.finish]
+    return [line.system, line.zone, line.activity, line.start, line.finish, line.material]
 
 
 def _pipe_row(pipe: SurveyPipe) -> list[Any]:
@@ -137,6 +139,8 @@ def _pipe_row(pipe: SurveyPipe) -> list[Any]:
         row.get("class_probability"),
         row.get("visible_arc_deg"),
         row.get("points"),
+        row.get("material"),
+        row.get("material_probability"),
     ]
 
 

@@ -203,6 +203,8 @@ def _pipe(message: msg.Pipe) -> Pipe:
         message.points,
         message.class_kmeans,
         (PipeEnd(message.start_sigma, message.start_state), PipeEnd(message.end_sigma, message.end_state)),
+        message.material,
+        message.material_probability,
     )
 
 

@@ -222,6 +222,8 @@ def _left_out(survey: Survey) -> list[str]:
         radius = 1e3 * float(pipe["radius"])
         near = sorted(radii, key=lambda name: abs(radii[name] - radius))[:2]
         why = "two classes explain its radius" if pipe.get("ambiguous") else "no class has its radius"
+        if pipe.get("ambiguous") and pipe.get("material_probability"):
+            why = f"{why}, and its look does not tell which"
         nearest = ", ".join(f"{name} {radii[name]:.1f} mm" for name in near)
         sentences.append(
             f"{pipe['id']}, {float(pipe['length']):.2f} m, radius {radius:.1f} mm: {why}"

@@ -113,7 +113,10 @@ def _check_pipe(pipe: dict[str, Any], where: str) -> None:
     for key in ("radius_sigma", "rmse"):
         if pipe.get(key) is not None or key not in pipe:
             number(pipe, key, where)
-    for key in ("class_probability", "visible_arc_deg", "points", "length_sigma", "hidden_m", "not_seen_m"):
+    for key in (
+        *("class_probability", "visible_arc_deg", "points", "length_sigma", "hidden_m", "not_seen_m"),
+        "material_probability",
+    ):
         if pipe.get(key) is not None:
             number(pipe, key, where)
     if not isinstance(pipe.get("id"), str):
@@ -125,7 +128,7 @@ def _check_pipe(pipe: dict[str, Any], where: str) -> None:
         _check_end(row, f"an end of {where}")
     if "class" not in pipe:
         raise InputError(f"'class' is missing in {where}")
-    for key in ("class", "class_kmeans"):
+    for key in ("class", "class_kmeans", "material"):
         if pipe.get(key) is not None and not isinstance(pipe[key], str):
             raise InputError(f"{key} of {where} is {shown(pipe[key])}, not a name")
 

@@ -187,7 +187,7 @@ def _has_details(planned: PipeClass) -> bool:
 
 def _line_entry(line: BillLine) -> dict[str, Any]:
     """A line of the bill by the keys of BOQ.yaml, without what is not given."""
-    details = {key: getattr(line, key) for key in ("system", "zone", "activity", "start", "finish")}
+    details = {key: getattr(line, key) for key in ("material", "system", "zone", "activity", "start", "finish")}
     given = {key: text for key, text in details.items() if text}
     return {"name": line.name, "planned_length_m": line.planned_length, **given}
 
@@ -258,7 +258,12 @@ def _pipe_entry(pipe: Pipe, product: Product) -> dict[str, Any]:
         "points": int(pipe.points),
         "length_sigma": _significant(product.length_sigma(pipe)),
         "ends": [{"state": end.state, "sigma": _significant(end.sigma)} for end in pipe.ends],
+        **(_material_fields(pipe) if pipe.material_probability > 0.0 else {}),
     }
+
+
+def _material_fields(pipe: Pipe) -> dict[str, Any]:
+    return {"material": pipe.material or None, "material_probability": round(pipe.material_probability, 4)}
 
 
 def _class_entry(entry: ClassProgress, product: Product) -> dict[str, Any]:

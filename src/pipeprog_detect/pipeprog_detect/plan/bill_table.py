@@ -28,6 +28,7 @@ _HEADINGS = {
     "wall_mm": ("wall", "wall thickness", "wand", "wandstärke", "wanddicke"),
     "planned_length_m": ("planned length", "planned", "length", "quantity", "geplante länge", "länge", "menge"),
     "color": ("color", "colour", "farbe"),
+    "material": ("material", "werkstoff"),
     "system": ("system", "anlage", "gewerk"),
     "zone": ("zone", "area", "bereich", "abschnitt"),
     "activity": ("activity", "activity id", "vorgang", "vorgangsnummer"),

@@ -16,6 +16,7 @@ from pipeprog_camera.outside_text import name_of, nearest, shown
 from pipeprog_detect.plan.entry import Entry, Segment
 from pipeprog_detect.plan.plan_file import read_plan
 from pipeprog_detect.product.class_colors import Color, distinct_colors, read_color
+from pipeprog_detect.product.materials import MATERIALS, read_material
 from pipeprog_detect.product.standard_sizes import find_size, nearest_name
 from pipeprog_detect.product.unit_check import WrittenSize, ask_about_units
 from pipeprog_detect.types import Cylinder
@@ -34,12 +35,12 @@ _NO_COLOR: Color = (0.5, 0.5, 0.5)  # until all classes are known
 _SIZE_KEYS = ("outer_radius_mm", "outer_diameter_mm", "size")
 _LINE_KEYS = ("system", "zone", "activity")  # these tell lines of one size apart
 _DATE_KEYS = ("start", "finish")
-_KEYS = ("name", *_SIZE_KEYS, "wall_mm", "planned_length_m", "color", *_LINE_KEYS, *_DATE_KEYS)
+_KEYS = ("name", *_SIZE_KEYS, "wall_mm", "planned_length_m", "color", "material", *_LINE_KEYS, *_DATE_KEYS)
 
 
 @dataclass(frozen=True)
 class BillLine:
-    """A line of the bill: name and planned length [m]; system, zone, activity and ISO dates are empty if not given."""
+    """A line of the bill: name and planned length [m]; the others are empty if not given, dates are ISO dates."""
 
     name: str
     planned_length: float
@@ -48,6 +49,7 @@ class BillLine:
     activity: str = ""
     start: str = ""
     finish: str = ""
+    material: str = ""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class PipeClass:
 
     wall [m] is the thickness of its wall, None where it is not given; a camera inside sees the bore.
     lines are those of the bill that have this size: two systems of one size are one class, since its pipes look alike.
+    material is the one of `MATERIALS` that all its lines name, empty where they name none.
     """
 
     name: str
@@ -65,6 +68,12 @@ class PipeClass:
     tolerance: float
     wall: float | None = None
     lines: tuple[BillLine, ...] = ()
+
+    @property
+    def material(self) -> str:
+        """See above."""
+        named = {line.material for line in self.lines}
+        return named.pop() if len(named) == 1 and named <= set(MATERIALS) else ""
 
     @property
     def bores(self) -> tuple[tuple[float, float], ...]:
@@ -94,6 +103,11 @@ class BillOfQuantities:
 
     classes: tuple[PipeClass, ...]
     pipes: tuple[PlannedPipe, ...] = ()
+
+    @property
+    def radii(self) -> tuple[float, ...]:
+        """The outer radii [m], each once."""
+        return tuple(dict.fromkeys(planned.outer_radius for planned in self.classes))
 
     @classmethod
     def of_radii(cls, radii: Mapping[str, float]) -> BillOfQuantities:
@@ -149,7 +163,7 @@ def _grouped(items: Sequence[_Item]) -> BillOfQuantities:
     """The bill of all items; those of one size become one class of several lines."""
     groups: list[list[_Item]] = []
     for item in items:
-        group = next((group for group in groups if _same_size(group[0], item)), None)
+        group = next((group for group in groups if _look_alike(group[0], item, items)), None)
         _refuse_double(item, group or [], [other for other in groups if other is not group])
         if group is None:
             groups.append([item])
@@ -164,6 +178,14 @@ def _grouped(items: Sequence[_Item]) -> BillOfQuantities:
         for one in item.segments
     ]
     return BillOfQuantities(_with_colors(classes, colors), tuple(pipes))
+
+
+def _look_alike(one: _Item, other: _Item, items: Sequence[_Item]) -> bool:
+    """Whether two items have one size and are not told apart by their materials, which all items of the size name."""
+    if not _same_size(one, other):
+        return False
+    named = all(item.planned.material for item in items if _same_size(item, one))
+    return not named or one.planned.material == other.planned.material
 
 
 def _same_size(one: _Item, other: _Item) -> bool:
@@ -184,7 +206,7 @@ def _refuse_double(item: _Item, group: Sequence[_Item], other_sizes: Sequence[Se
         raise InputError(
             f"{item.where}: classes {shown(alike[0].name)} and {shown(new.name)} have the same outer radius "
             f"{1e3 * item.planned.outer_radius:g} mm and cannot be told apart: merge them, or give each its system, "
-            "zone or activity"
+            f"zone or activity, or a material that can be seen ({', '.join(MATERIALS[:4])}, ...)"
         )
 
 
@@ -243,11 +265,12 @@ def _read_line(where: str, name: str, entry: dict[str, object]) -> BillLine:
     length = _positive(where, "planned_length_m", entry["planned_length_m"])
     if length > MAX_PIPE_LENGTH:
         raise InputError(f"{where}: planned_length_m is {length:g}: write metres, {MAX_PIPE_LENGTH:g} at most")
+    material = read_material(where, entry["material"]) if "material" in entry else ""
     system, zone, activity = (name_of(entry[key], f"{where}: {key}") if key in entry else "" for key in _LINE_KEYS)
     start, finish = (_read_day(f"{where}: {key}", entry[key]) if key in entry else "" for key in _DATE_KEYS)
     if start and finish and finish < start:
         raise InputError(f"{where}: finish {finish} lies before start {start}: mend one of them")
-    return BillLine(name, length, system, zone, activity, start, finish)
+    return BillLine(name, length, system, zone, activity, start, finish, material)
 
 
 def _read_day(where: str, value: object) -> str:

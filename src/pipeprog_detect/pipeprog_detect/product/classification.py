@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,12 @@ from pipeprog_detect.types import Pipe
 _REJECT = 4.0
 # Under this probability the class is ambiguous, and none is named.
 SURE = 0.95
+# Classes that the radius makes less likely than this are out of the question, whatever they look like.
+_PLAUSIBLE = 0.001
+# What is told of a look that was asked [probability], so that it differs from one that was not.
+_LEAST = 1e-4
+# A pipe that looks like one of the plausible classes' materials with less than this probability looks like none.
+_LIKE_ONE = 0.2
 # Steps of k-means; over radii of a site the labels settle in fewer than ten.
 _KMEANS_STEPS = 100
 
@@ -57,6 +63,43 @@ def classify(radius: float, sigma: float, boq: BillOfQuantities, concave: bool =
         return Verdict(None, 0.0)
     probability = float(posterior[best])
     return Verdict(boq.classes[best].name if probability >= SURE else None, probability)
+
+
+def asks_look(pipe: Pipe, boq: BillOfQuantities, concave: bool = False) -> bool:
+    """Whether the classes that the radius leaves differ in their materials, which all of them name."""
+    plausible = _plausible(_posterior(pipe.cylinder.radius, pipe.radius_sigma, boq, concave), boq)
+    return len(set(plausible)) > 1 and "" not in plausible
+
+
+def classified_by_look(pipe: Pipe, boq: BillOfQuantities, look: Mapping[str, float], concave: bool = False) -> Pipe:
+    """A pipe for which `asks_look`, with its class by radius and look and its material.
+
+    The posterior of a class is that by the radius times the probability of its material by the look. A pipe that looks
+    like none of the materials, or too much like two, has neither class nor material.
+    """
+    posterior = _posterior(pipe.cylinder.radius, pipe.radius_sigma, boq, concave)
+    materials = [planned.material for planned in boq.classes]
+    likely = sum(look.get(material, 0.0) for material in set(_plausible(posterior, boq)))
+    joint = posterior * np.array([look.get(material, 0.0) for material in materials])
+    if likely < _LIKE_ONE or not joint.sum() > 0.0:
+        return replace(pipe, class_name=None, material="", material_probability=max(float(likely), _LEAST))
+    joint /= joint.sum()
+    shares: dict[str, float] = {}
+    for material, share in zip(materials, joint.tolist(), strict=True):
+        shares[material] = shares.get(material, 0.0) + share
+    best, seen = int(np.argmax(joint)), max(shares, key=lambda material: shares[material])
+    return replace(
+        pipe,
+        class_name=boq.classes[best].name if joint[best] >= SURE else None,
+        class_probability=float(joint[best]),
+        material=seen if shares[seen] >= SURE else "",
+        material_probability=shares[seen],
+    )
+
+
+def _plausible(posterior: FloatArray, boq: BillOfQuantities) -> list[str]:
+    """Materials of the classes that a posterior by the radius leaves."""
+    return [planned.material for planned, share in zip(boq.classes, posterior, strict=True) if share > _PLAUSIBLE]
 
 
 def is_planned(radius: float, sigma: float, boq: BillOfQuantities) -> bool:

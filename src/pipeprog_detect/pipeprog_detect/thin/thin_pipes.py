@@ -70,7 +70,7 @@ def find_thin_pipes(
         boq: the bill of quantities.
         edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
-    radii = [planned.outer_radius for planned in boq.classes if planned.outer_radius < thickest]
+    radii = [radius for radius in boq.radii if radius < thickest]
     if not views or not radii:
         return []
     lines = _LineFitter(views, points.astype(np.float32), radii, boq)

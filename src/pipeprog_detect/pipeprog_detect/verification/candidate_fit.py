@@ -108,7 +108,7 @@ class CandidateFitter:
         return max(good, key=lambda fit: fit.support, default=None)
 
     def _radii(self) -> list[float]:
-        return [planned.outer_radius for planned in self.boq.classes]
+        return list(self.boq.radii)
 
     def _starts(self, candidate: Candidate, trusted: bool) -> list[Start]:
         """Where the contour is sought: at the candidate's radius, and at planned ones if the cloud leaves it open."""

@@ -106,6 +106,19 @@ class ScaleEstimate:
     measurements: tuple[Measurement, ...]
     warnings: tuple[str, ...]
 
+    @property
+    def board_circles(self) -> FloatArray:
+        """Centres in the map and radii (N, 4) of the boards' circles [m]."""
+        rotation, shift = self.map_from_model[:3, :3], self.map_from_model[:3, 3]
+        rows = [
+            np.c_[
+                place.circles_in_model @ rotation.T + shift,
+                np.full(len(place.board.centres), place.board.circle_radius),
+            ]
+            for place in self.boards
+        ]
+        return np.concatenate([np.empty((0, 4)), *rows])
+
 
 @dataclass(frozen=True)
 class Combined:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 from pathlib import Path
 
@@ -55,6 +56,7 @@ def test_csv_has_whole_numbers_and_no_formulas(folder: Path, tmp_path: Path) -> 
         "installed_sigma_um": "",
         "percent": "60",
         "pipes": "1",
+        **dict.fromkeys(("missing_mm", "unclear_mm", "hidden_mm", "not_seen_mm", "walls_seen_percent"), ""),
     }
     assert second["installed_mm"] == "1250"
     with pipes.open(encoding="utf-8-sig", newline="") as stream:
@@ -64,6 +66,29 @@ def test_csv_has_whole_numbers_and_no_formulas(folder: Path, tmp_path: Path) -> 
     ]
     numbers = [cell for row in rows for key, cell in row.items() if key.rpartition("_")[2] in ("um", "mm", "percent")]
     assert all(re.fullmatch(r"-?\d*", cell) for cell in numbers)
+
+
+def test_csv_and_workbook_tell_coverage_and_material(folder: Path, tmp_path: Path) -> None:
+    content = json.loads((folder / "pipes.json").read_text())
+    content["classes"][0] |= {"missing_m": 0.5, "not_seen_m": 0.7945, "walls_seen_percent": 83.2}
+    content["pipes"][0] |= {"hidden_m": 0.25, "material": "copper", "material_probability": 0.987}
+    content["pipes"][1] |= {"material": None, "material_probability": 0.6}
+    (folder / "pipes.json").write_text(json.dumps(content))
+    classes, pipes, book = export(folder, ["csv", "xlsx"], tmp_path / "out")
+    with classes.open(encoding="utf-8-sig", newline="") as stream:
+        first, second = csv.DictReader(stream)
+    columns = ("missing_mm", "unclear_mm", "hidden_mm", "not_seen_mm", "walls_seen_percent")
+    assert [first[key] for key in columns] == ["500", "", "", "794", "83"]
+    assert {second[key] for key in columns} == {""}
+    with pipes.open(encoding="utf-8-sig", newline="") as stream:
+        rows = [
+            [row[key] for key in ("hidden_mm", "not_seen_mm", "material", "material_probability_percent")]
+            for row in csv.DictReader(stream)
+        ]
+    assert rows == [["250", "", "copper", "99"], ["", "", "", "60"], ["", "", "", ""]]
+    sheet = list(load_workbook(book)["Pipes"].iter_rows(values_only=True))
+    assert sheet[0][-2:] == ("Material seen", "Probability of the material")
+    assert [row[-2:] for row in sheet[1:]] == [("copper", 0.987), (None, 0.6), (None, None)]
 
 
 def test_the_same_results_give_the_same_bytes(folder: Path, tmp_path: Path) -> None:
