@@ -97,27 +97,33 @@ def pictures_of(site: Site, rng: np.random.Generator, seed: int) -> tuple[list[V
     return views, pictures
 
 
-def looks_of(site: Site, views: Sequence[View], pictures: Sequence[Picture]) -> list[tuple[int, FloatArray]]:
-    """Number of the material and features of each pipe, by the board and without it."""
-    pipes = [Cylinder(pipe.start, pipe.end, pipe.radius) for pipe in site.pipes]
-    centres = np.concatenate(site.boards)
-    circles = BoardCircles(centres, np.full(len(centres), BOARD_CIRCLE_RADIUS))
+def looks_of_pipes(
+    pipes: Sequence[Cylinder], views: Sequence[View], pictures: Sequence[Picture], circles: BoardCircles
+) -> list[tuple[int, FloatArray]]:
+    """Number and features of each pipe that the views show; `pictures` by the views' stamps."""
+    in_colour = colour_views(views, pictures.__getitem__, pipes, circles)
     found = []
-    for told in (circles, NO_CIRCLES):
-        in_colour = colour_views(views, pictures.__getitem__, pipes, told)
-        for number, pipe in enumerate(pipes):
-            barrel = barrel_light(pipe, in_colour, pipes[:number] + pipes[number + 1 :])
-            features = None if barrel is None else look_features(barrel)
-            if features is not None:
-                found.append((KINDS.index(site.pipes[number].material), features))
+    for number, pipe in enumerate(pipes):
+        barrel = barrel_light(pipe, in_colour, [*pipes[:number], *pipes[number + 1 :]])
+        features = None if barrel is None else look_features(barrel)
+        if features is not None:
+            found.append((number, features))
     return found
 
 
 def generated(seed: int) -> list[tuple[int, FloatArray]]:
-    """Materials and features of one site."""
+    """Number of the material and features of each pipe of one site, by the board and without it."""
     rng = np.random.default_rng([seed, 7])
     site = build_rack(rng, float(rng.uniform(0.2, 1.2)), 0.0, float(rng.uniform(1.2, 2.5)))
-    return looks_of(site, *pictures_of(site, rng, seed))
+    views, pictures = pictures_of(site, rng, seed)
+    pipes = [Cylinder(pipe.start, pipe.end, pipe.radius) for pipe in site.pipes]
+    centres = np.concatenate(site.boards)
+    circles = BoardCircles(centres, np.full(len(centres), BOARD_CIRCLE_RADIUS))
+    return [
+        (KINDS.index(site.pipes[number].material), features)
+        for told in (circles, NO_CIRCLES)
+        for number, features in looks_of_pipes(pipes, views, pictures, told)
+    ]
 
 
 def learned(features: FloatArray, kinds: IntArray, sites: IntArray) -> MaterialModel:
