@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.octree import THREADS
@@ -21,6 +22,8 @@ from pipeprog_detect.types import Cylinder, View
 COLUMNS, MOST_POINTS = 160, 1_200_000
 # The second nearest point of a cell counts: a single one may be a stray of the stereo.
 LEAST_POINTS = 2
+# A cell that shows what is farther than all eight around it is a hole of the cloud, not a gap in what hides the rest.
+AROUND = np.array([[True, True, True], [True, False, True], [True, True, True]])
 # A surface is hidden by what lies nearer by more than this [m]: stereo spreads depth edges by about a centimetre, and
 # clamps stand out from the pipe that they hold by up to two.
 BEFORE = 0.03
@@ -38,7 +41,8 @@ def with_depths(views: Sequence[View], points: NDArray[np.floating]) -> list[Vie
         rows = max(int(np.ceil(camera.height / cell)), 1)
         pose = view.camera_from_map[:3].astype(np.float32)
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-        return replace(view, nearest=_nearest(some, pose, lens, np.float32(cell), rows, COLUMNS, LEAST_POINTS))
+        nearest = _nearest(some, pose, lens, np.float32(cell), rows, COLUMNS, LEAST_POINTS)
+        return replace(view, nearest=np.minimum(nearest, maximum_filter(nearest, footprint=AROUND)))
 
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(seen, views))

@@ -51,3 +51,15 @@ def test_a_slanted_surface_does_not_hide_itself(view: View) -> None:
     strip = np.concatenate([row + np.array([0.0, y, 0.0]) for y in np.arange(-0.1, 0.1, 0.004)])
     seen = with_depths([view], strip)[0]
     assert not hidden_by_cloud(seen, *_seen_at(view, row[::50])).any()
+
+
+def test_a_hole_in_the_cloud_of_what_hides_shows_nothing_behind_it(view: View) -> None:
+    plate = np.concatenate([_plate(1.0, -0.5, 0.5), _plate(1.0, -0.498, 0.5) + np.array([0.0, 0.002, 0.0])])
+    hole = np.abs(_seen_at(view, plate)[0] - [161.0, 91.0]).max(axis=1) < 1.01  # one cell of two pixels
+    behind = np.array([[0.01, 0.01, 2.0]])
+    behind[:, :2] = (np.array([161.0, 91.0]) - [159.5, 89.5]) / 300.0 * 2.0
+    for cloud in (plate[~hole], np.concatenate([plate[~hole], _plate(2.0, -1.0, 1.0)])):
+        assert hidden_by_cloud(with_depths([view], cloud)[0], *_seen_at(view, behind)).all()
+    gap = np.abs(_seen_at(view, plate)[0][:, 0] - 161.0) < 1.01  # a slit from top to bottom is one to look through
+    slit = with_depths([view], np.concatenate([plate[~gap], _plate(2.0, -1.0, 1.0)]))[0]
+    assert not hidden_by_cloud(slit, *_seen_at(view, behind)).any()
