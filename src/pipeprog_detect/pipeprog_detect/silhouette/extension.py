@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeprog_camera.arrays import FloatArray
+from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
-from pipeprog_detect.silhouette.edge_support import SupportProfile
+from pipeprog_detect.silhouette.edge_support import SupportProfile, hits, support_profile
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene
@@ -27,6 +28,11 @@ BESIDE, LEAST_CONTRAST = 4.0, 0.15
 TEXTURE, TEXTURE_SEEN = 0.2, 20.0
 # Correlation between views of the evidence at one position: specks of texture and dark areas are common to them.
 COMMON = 0.3
+# What a sample shows: no edge, or one that is brighter or darker within the contour than this far beside it [px].
+NO_EDGE, BRIGHTER, DARKER = 0, 1, 2
+STEP_AT = np.array([-1.5, 1.5])
+# One view in twenty fails to show a contour; the number of views that this prior weighs.
+FAILING, FAILING_SEEN = 0.05, 20.0
 # Bounds of the rates: contours differ along a pipe, so that neither an edge nor its absence is ever certain evidence.
 LEAST_RATE, MOST_RATE = 0.02, 0.9
 # Logarithm of the odds from which a further stretch is taken for the pipe's: wrong once in a thousand times.
@@ -175,38 +181,68 @@ def axial_evidence(scene: Scene, at_end: bool, ahead: float) -> AxialEvidence | 
     back = min(0.5 * cylinder.length, 0.5 * FARTHEST)
     scene = scene.turned_to(cylinder)
 
-    def profile(aside: float, inner: float, limit: int) -> SupportProfile:
+    def beyond(aside: float, inner: float) -> Scene:
         shift = aside * scene.basis[0]
-        stretch = Cylinder(end - inner * axis + shift, end + ahead * axis + shift, cylinder.radius)
-        return replace(scene, cylinder=stretch).support(TOLERANCE, SPACING, limit)
+        return replace(
+            scene, cylinder=Cylinder(end - inner * axis + shift, end + ahead * axis + shift, cylinder.radius)
+        )
 
-    on = profile(0.0, back, SAMPLES)
+    ahead_of = beyond(0.0, back)
+    samples, edges = ahead_of.edges(TOLERANCE, SPACING, SAMPLES)
+    hit = hits(edges, scene.shift_of(samples))
+    on = support_profile(samples, hit)
     along = on.along + 0.5 * (ahead - back)
     known = along < 0
     if on.seen[known].sum() < MIN_SAMPLES:
         return None
     aside = 2.0 * cylinder.radius + BESIDE / on.gain
-    beside = [profile(sign * aside, 0.0, SAMPLES_BESIDE) for sign in (-1.0, 1.0)]
-    log_odds = _log_odds(on, known, beside)
-    return None if log_odds is None else AxialEvidence(along, log_odds, on.seen.sum(axis=1))
+    chance = _chance([beyond(sign * aside, 0.0).support(TOLERANCE, SPACING, SAMPLES_BESIDE) for sign in (-1.0, 1.0)])
+    light = ahead_of.light(samples, STEP_AT, SPACING)
+    seen = np.where(hit, np.where(light[:, 0] > light[:, 1], BRIGHTER, DARKER), NO_EDGE)
+    odds = _log_odds(samples, seen, on, known, chance)
+    return None if odds is None else AxialEvidence(along, odds, on.seen.sum(axis=1))
 
 
-def _log_odds(on: SupportProfile, known: NDArray[np.bool_], beside: list[SupportProfile]) -> FloatArray | None:
-    """The logarithm (N,) of the odds that edges are the pipe's; None where it shows hardly more than lines beside it.
-
-    The rate of edges on the pipe is that of its `known` positions (N,).
-    """
+def _chance(beside: list[SupportProfile]) -> float:
+    """The rate of edges on lines beside the pipe."""
     found, looked = (sum(float(getattr(each, name).sum()) for each in beside) for name in ("hits", "seen"))
-    chance = (found + TEXTURE * TEXTURE_SEEN) / (looked + TEXTURE_SEEN)
-    rate = on.hits[known].sum(axis=0) / np.maximum(on.seen[known].sum(axis=0), 1.0)
-    if on.hits[known].sum() / on.seen[known].sum() - chance < LEAST_CONTRAST:
+    return max((found + TEXTURE * TEXTURE_SEEN) / (looked + TEXTURE_SEEN), LEAST_RATE)
+
+
+def _log_odds(
+    samples: ContourSamples, seen: IntArray, on: SupportProfile, known: NDArray[np.bool_], chance: float
+) -> FloatArray | None:
+    """The logarithm (B,) of the odds that what is `seen` (N,) at each position is the pipe's, given all inner ones.
+
+    How often each outcome occurs on each side of the pipe is taken from its `known` positions (B,): a pipe is brighter
+    than what is behind it, or darker, along most of a side, where edges of texture are either. None where that hardly
+    differs from `chance`, the rate of edges beside the pipe.
+
+    A view may fail to show the contour at all: its pose is off by more than edges count within, or what hides the pipe
+    is not known. One that shows the known part is no such view; one that does not says little by not showing the pipe
+    farther out.
+    """
+    position, side = samples.positions()[1], samples.side
+    inner = known[position]
+    count = np.bincount(3 * side[inner] + seen[inner], minlength=6).reshape(2, 3).astype(float)
+    beside = np.array([1.0 - chance, 0.5 * chance, 0.5 * chance])
+    hit = count[:, 1:].sum(axis=1, keepdims=True)
+    rate = np.clip(hit / np.maximum(count.sum(axis=1, keepdims=True), 1.0), chance, MOST_RATE)
+    of_hits = np.clip((count[:, 1:] + 1.0) / (hit + 2.0), 1.0 - MOST_RATE, MOST_RATE)
+    likely = np.hstack([1.0 - rate, rate * of_hits])
+    contrast = 0.5 * np.abs(likely - beside).sum(axis=1)
+    if contrast @ count.sum(axis=1) < LEAST_CONTRAST * count.sum():
         return None
-    rate = np.clip(rate, chance, MOST_RATE)
-    share = on.hits / np.maximum(on.seen, 1.0)
-    count = on.seen / (1.0 + COMMON * np.maximum(on.seen - 1.0, 0.0))
-    against = np.log((1.0 - rate) / (1.0 - max(chance, LEAST_RATE)))
-    odds = count * (share * np.log(rate / max(chance, LEAST_RATE)) + (1.0 - share) * against)
-    return np.asarray(odds.sum(axis=1), np.float64)
+    weight = 1.0 / (1.0 + COMMON * np.maximum(on.seen[position, side] - 1.0, 0.0))
+    odds = weight * np.log(likely / beside)[side, seen]
+    views, places = int(samples.view.max()) + 1, len(known)
+    total = np.cumsum(
+        np.bincount(samples.view * places + position, odds, views * places).reshape(views, places), axis=1
+    )
+    within = total[np.unique(samples.view[inner]), int(known.sum()) - 1]
+    failed = FAILING / (FAILING + (1.0 - FAILING) * np.exp(within))
+    failing = (float(failed.sum()) + FAILING * FAILING_SEEN) / (len(within) + FAILING_SEEN)
+    return np.diff(np.logaddexp(np.log1p(-failing) + total, np.log(failing)).sum(axis=0), prepend=0.0)
 
 
 def _further(evidence: AxialEvidence, clamp: float) -> float:

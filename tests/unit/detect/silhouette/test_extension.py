@@ -8,8 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.extension import axial_evidence, extended
+from pipeprog_detect.silhouette.edge_support import support_profile
+from pipeprog_detect.silhouette.extension import BRIGHTER, DARKER, NO_EDGE, _log_odds, axial_evidence, extended
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -74,3 +77,50 @@ def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
 
 def test_no_evidence_without_a_pipe(empty_views: list[View]) -> None:
     assert axial_evidence(Scene.of(PIPE, empty_views, []), True, 0.2) is None
+
+
+def _odds_of(view: IntArray, along: FloatArray, seen: IntArray, chance: float) -> FloatArray:
+    """The log odds (B,) of what samples of both sides show at positions `along` (N,); the negative ones are known."""
+    count = len(view)
+    nothing = np.zeros(2 * count)
+    samples = ContourSamples(
+        np.tile(view, 2),
+        np.repeat([0, 1], count),
+        np.zeros((2 * count, 2)),
+        np.zeros((2 * count, 2)),
+        np.tile(along, 2),
+        nothing,
+        nothing,
+        nothing,
+        np.zeros((2 * count, 5)),
+    )
+    seen = np.tile(seen, 2)
+    on = support_profile(samples, seen != NO_EDGE)
+    odds = _log_odds(samples, seen, on, on.along < 0, chance)
+    assert odds is not None
+    return odds
+
+
+PLACES = np.arange(-20, 20) + 0.5
+
+
+def test_a_view_that_never_shows_the_pipe_says_little_by_not_showing_it_farther_out() -> None:
+    """Its pose is off by a pixel, say: it ends no pipe. One that has shown the pipe does."""
+    inner, outer = PLACES[PLACES < 0], PLACES[PLACES > 0]
+    shows = np.where(np.arange(len(inner)) % 5 == 0, NO_EDGE, BRIGHTER)
+    one = np.concatenate([np.zeros(20, int)] * 2), np.concatenate([inner, outer])
+    ended = _odds_of(*one, np.concatenate([shows, np.full(20, NO_EDGE)]), 0.2)[20:].sum()
+    strange = _odds_of(np.repeat([0, 1], 20), one[1], np.concatenate([shows, np.full(20, NO_EDGE)]), 0.2)[20:].sum()
+    assert ended < -10.0
+    assert -4.0 < strange < 0.0
+
+
+def test_edges_that_are_brighter_and_darker_by_turns_are_texture() -> None:
+    """A thin pipe shows edges as often as the wall's texture does; all along it they are of one kind."""
+    view = np.repeat(np.arange(3), len(PLACES))
+    along = np.tile(PLACES, 3)
+    edge = np.where(np.arange(len(along)) % 3 == 0, NO_EDGE, BRIGHTER)
+    turns = np.where((along > 0) & (edge == BRIGHTER) & (np.arange(len(along)) % 2 == 0), DARKER, edge)
+    chance = 0.5
+    assert _odds_of(view, along, edge, chance)[20:].sum() > 10.0
+    assert _odds_of(view, along, turns, chance)[20:].sum() < -2.0
