@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import ViewArrays, in_image, project
 from pipeprog_detect.silhouette.occlusion import BEFORE, cylinder_rows, hidden_by_cylinders
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 
 # Distance [m] between the positions looked at: less than a cell of a view's depths (8 px: 16 mm at 2 m with 1000 px).
@@ -20,6 +21,8 @@ STEP = 0.01
 MIN_VIEWS, MIN_SHARE = 3, 0.5
 # What is seen lies behind where it is farther from the axis than the inside of an open end, one radius, and a fifth.
 BEHIND_RADII = 1.2
+# A stretch whose contour, looked at this often [px], has support along more than half of it is no gap.
+SPACING, CONVINCING = 6, 0.5
 # Free stretches shorter than this [m] are left out: two cells of a view's depths.
 SHORTEST = 0.03
 
@@ -28,7 +31,7 @@ def free_stretches(cylinder: Cylinder, views: Sequence[View], others: Sequence[C
     """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
 
     Args:
-        cylinder: whose axis is looked at.
+        cylinder: whose axis is looked at, and whose contour decides where stereo has holes.
         views: the keyframes, with the depths of the nearest surfaces (`with_depths`).
         others: further cylinders, which may hide it.
     """
@@ -46,7 +49,16 @@ def free_stretches(cylinder: Cylinder, views: Sequence[View], others: Sequence[C
     edges = np.flatnonzero(np.diff(np.r_[False, free, False].astype(np.int8)))
     step = cylinder.length / count
     stretches = [(float(first * step), float(last * step)) for first, last in edges.reshape(-1, 2)]
-    return [(first, last) for first, last in stretches if last - first > SHORTEST]
+    return [
+        (first, last)
+        for first, last in stretches
+        if last - first > SHORTEST and not _shows_a_contour(cylinder.cut(first, last), views, others)
+    ]
+
+
+def _shows_a_contour(stretch: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
+    """Whether the views show the contour of a stretch: then a hole in the cloud of its face let them through."""
+    return Scene.of(stretch, views, others).support(spacing=SPACING).share >= CONVINCING
 
 
 def _looked_through(

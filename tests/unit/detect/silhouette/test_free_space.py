@@ -12,6 +12,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
 from tests.unit.detect.straight_ahead import looking_along_y
 
 HALF, WALL = 0.8, 0.25  # m: half of the line's length, and how far behind it the wall is
@@ -68,3 +69,15 @@ def test_a_pipe_thinner_than_the_cells_is_not_judged() -> None:
 def test_two_views_are_too_few() -> None:
     views = seen(tube(-HALF, -0.1, 0.03), tube(0.1, HALF, 0.03))
     assert free_stretches(line(0.03), views[:2], []) == []
+
+
+def test_a_hole_in_the_cloud_of_a_pipe_is_not_free_where_its_contour_is_seen(
+    pipe_views: list[View], empty_views: list[View]
+) -> None:
+    low, high = PIPE.start + 0.15 * PIPE.axis, PIPE.start + 0.25 * PIPE.axis
+    surface = front_points(PIPE)
+    along = (surface - PIPE.start) @ PIPE.axis
+    torn = np.concatenate([wall_points(), surface[(along < 0.15) | (along > 0.25)]])
+    hole = Cylinder(low, high, PIPE.radius)
+    assert free_stretches(hole, with_depths(empty_views, torn), [])
+    assert free_stretches(hole, with_depths(pipe_views, torn), []) == []
