@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
@@ -87,15 +89,13 @@ class CandidateFitter:
     def of_planned_radius(
         self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]
     ) -> ContourFit | None:
-        """The best supported fit of a planned radius that the cloud of a blurred candidate allows; None without one.
+        """The best supported fit of a planned radius that the cloud of a candidate allows; None without one.
 
         Lines beside a thin pipe, such as its shadow's, are taken for its contour where its radius is left open. A fit
         that they have led three standard deviations away from the planned radius is one of theirs.
         """
-        if not candidate.blurred:
-            return None
         noise, cylinder = candidate.evidence.noise, candidate.cylinder
-        near = [planned for planned in self._radii() if abs(planned - cylinder.radius) < REACH * _sigma(candidate)]
+        near = self._within_reach(candidate)
         fits = [(planned, _at_radius(cylinder, planned, noise, views, others)) for planned in near]
         good = [
             fit
@@ -107,6 +107,33 @@ class CandidateFitter:
         ]
         return max(good, key=lambda fit: fit.support, default=None)
 
+    def of_visible_side(
+        self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]
+    ) -> ContourFit | None:
+        """The fit of a candidate of which others hide one side in all views, with the planned radius that it allows.
+
+        None where it allows none, or several.
+        The other side and the cloud tell its axis; the cloud alone does not tell its radius better than the plan does.
+        """
+        near = self._within_reach(candidate)
+        if len(near) != 1:
+            return None
+        sigma = _sigma(candidate)
+        seen = SeenArc(candidate.evidence.arc, sigma)
+        planned = replace(candidate.cylinder, radius=near[0])
+        fit = refine(Start(planned, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
+        return fit if fit is not None and fit.support > CONVINCING else None
+
+    def strays(self, candidate: Candidate, fit: ContourFit) -> bool:
+        """Whether the fit has a radius out of reach of the candidate's: it follows the edges of other things."""
+        sigma = float(np.hypot(_sigma(candidate), fit.radius_sigma))
+        return abs(fit.cylinder.radius - candidate.cylinder.radius) > REACH * sigma
+
+    def _within_reach(self, candidate: Candidate) -> list[float]:
+        """The planned radii [m] that the cloud of a candidate allows."""
+        reach = REACH * _sigma(candidate)
+        return [planned for planned in self._radii() if abs(planned - candidate.cylinder.radius) < reach]
+
     def _radii(self) -> list[float]:
         return list(self.boq.radii)
 
@@ -116,7 +143,7 @@ class CandidateFitter:
         seen = SeenArc(candidate.evidence.arc, sigma) if trusted and not candidate.blurred else None
         radii = [cylinder.radius]
         if candidate.blurred:
-            radii += [radius for radius in self._radii() if abs(radius - cylinder.radius) < REACH * sigma]
+            radii += self._within_reach(candidate)
         return [Start(replace(cylinder, radius=radius), sigma, ends_known=True, seen=seen) for radius in radii]
 
 

@@ -108,12 +108,16 @@ class KeyframeVerifier:
         if not self.has_views:
             return MeasuredPipe.of_cloud(candidate) if trusted else None
         fit = self._fitter.fit(candidate, others, self._views, trusted=trusted)
+        if fit is None and not trusted and is_resolved(candidate):
+            fit = self._fitter.of_visible_side(candidate, others, self._views)
         if fit is None and not (trusted and is_resolved(candidate)):
             return None
         if candidate.blurred or not trusted:
             # Where noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
             if fit is None or not self._fitter.is_planned(fit):
-                fit = self._fitter.of_planned_radius(candidate, others, self._views)
+                fit = self._fitter.of_planned_radius(candidate, others, self._views) if candidate.blurred else None
+            elif self._fitter.strays(candidate, fit):
+                fit = self._fitter.of_planned_radius(candidate, others, self._views) or fit
             if fit is None or (candidate.blurred and not self._stands_alone(fit.cylinder, others)):
                 return None
         else:

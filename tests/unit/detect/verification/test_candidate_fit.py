@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planned radii of blurred candidates: a fit that a shadow's line has led away from its radius is refused."""
+"""Fits with planned radii: of blurred candidates, of those of which one side is seen, and fits that stray."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ import pytest
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.types import Cylinder
+from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification import candidate_fit
 from pipeprog_detect.verification.candidate_fit import CandidateFitter
+from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
+from tests.unit.detect import pipe_and_wall
+from tests.unit.detect.straight_ahead import looking_along_y
 
 PLANNED, SIGMA = 0.0086, 0.00015
 PIPE = Cylinder(np.zeros(3), np.array([1.0, 0.0, 0.0]), 0.0105)
@@ -31,3 +34,41 @@ def test_a_fit_keeps_to_the_planned_radius_that_it_was_sought_with(
     boq = BillOfQuantities((PipeClass("copper 17", PLANNED, 10.0, (1.0, 0.0, 1.0), 1e-4),))
     assert BLURRED.blurred
     assert (CandidateFitter(boq, MeasurementCache()).of_planned_radius(BLURRED, [], []) is fit) is stands
+
+
+def _boq(*radii: float) -> BillOfQuantities:
+    return BillOfQuantities(
+        tuple(PipeClass(f"{1e3 * radius:.1f}", radius, 10.0, (0.0, 0.0, 1.0), 4e-4) for radius in radii)
+    )
+
+
+def test_of_a_pipe_that_shows_one_side_the_plan_tells_the_radius(pipe_views: list[View]) -> None:
+    """A neighbour hides its other side in all views; to the cloud it is 3 mm thicker, at 2 sigma, and too rough."""
+    true = pipe_and_wall.PIPE
+    neighbour = Cylinder(np.array([0.1, -0.08, -0.5]), np.array([0.08, -0.08, 0.5]), 0.09)
+    evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
+    rough = Candidate(replace(true, radius=true.radius + 0.003), 0.0015, 3000, evidence)
+    sides = [CandidateFitter(_boq(*radii), MeasurementCache()) for radii in ((true.radius, 0.1), (true.radius, 0.041))]
+    one, open_to_two = (fitter.of_visible_side(rough, [neighbour], pipe_views) for fitter in sides)
+    assert sides[0].fit(rough, [neighbour], pipe_views) is None
+    assert one is not None
+    assert open_to_two is None
+    assert one.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
+    assert np.linalg.norm(one.cylinder.from_axis(true.middle[None])[0]) < 3e-3
+
+
+def test_a_fit_out_of_the_candidates_reach_gives_way_to_a_planned_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two pipes of a rack 8 cm apart: the outer edge of one and that of the other make a thick pipe."""
+    rough = Candidate(replace(PIPE, radius=0.0436), 0.0023, 15000, CloudEvidence(2.6, 0.9, 0.0, 0.0032, 0.0, 3.0))
+    both, own = (
+        ContourFit(replace(PIPE, radius=radius), np.eye(5), 2e-4, support, 20, (0.0, 0.0), 0.0, 0.5)
+        for radius, support in ((0.0559, 0.85), (0.0367, 1.0))
+    )
+    boq = _boq(0.0365, 0.0559)
+    assert CandidateFitter(boq, MeasurementCache()).strays(rough, both)
+    assert not CandidateFitter(boq, MeasurementCache()).strays(rough, own)
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: both)
+    monkeypatch.setattr(candidate_fit, "_at_radius", lambda *_: own)
+    camera = looking_along_y(0.0, 0)
+    measured = KeyframeVerifier([camera], boq).measure([rough], [False])
+    assert [each.cylinder.radius for each in measured] == [own.cylinder.radius]
