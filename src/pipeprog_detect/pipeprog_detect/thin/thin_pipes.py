@@ -28,7 +28,7 @@ from pipeprog_detect.thin.parallel_axes import (
     propose_parallel,
 )
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.candidate_fit import CONVINCING
+from pipeprog_detect.verification.candidate_fit import CONVINCING, MANUFACTURE, REACH
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 
 # Proposals that are measured, and points of the cloud that bound their depths: a computing budget. More proposals than
@@ -45,6 +45,8 @@ PARALLEL_CONVINCING = ((CONVINCING, 0.5 * CONVINCING), (CONVINCING, 0.11))
 LINE_DEPTH_SIGMA = 0.03
 # The axes of pipes side by side are at least two radii apart.
 TOUCHING = 2.0
+# Their axes are known to this [m].
+AXIS_SIGMA = 1e-3
 # Flatness is 0 for a cylinder and 1 for a strip: one that exceeds the middle by two standard deviations is a strip.
 FLAT, SURELY = 0.5, 2.0
 
@@ -79,7 +81,7 @@ def find_thin_pipes(
     thin: list[MeasuredPipe] = []
 
     def consider(fit: ContourFit | None) -> None:
-        if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known):
+        if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
             return
         thin.append(MeasuredPipe(_as_candidate(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
         known.append(fit.cylinder)
@@ -93,6 +95,17 @@ def find_thin_pipes(
             fit = lines.measure(proposed, known, follow=False)
             consider(None if fit is None else lines.follow(fit, proposed.radius, known))
     return thin
+
+
+def is_shadow(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
+    """Whether it runs along a known pipe nearer than two pipes can lie: it is that one's shadow, or its edge."""
+    middle = cylinder.middle[None]
+    return any(
+        abs(float(other.axis @ cylinder.axis)) > np.cos(NEARLY_PARALLEL)
+        and 0.0 < float(other.along(middle)[0]) < other.length
+        and float(other.surface_distance(middle)[0]) < cylinder.radius - AXIS_SIGMA
+        for other in known
+    )
 
 
 def _is_rival(proposed: Cylinder, thin: Sequence[MeasuredPipe], views: Sequence[View]) -> bool:
@@ -169,11 +182,17 @@ class _LineFitter:
     def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], least: tuple[float, float]) -> bool:
         """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does.
 
+        Its radius is what tells it from the rods of hangers: it keeps to the planned one within three sigma.
+
         `least`: support required of the contour, and of each of its sides.
         """
         return (
             fit.support >= least[0]
             and is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
+            and any(
+                abs(fit.cylinder.radius - planned) < np.hypot(REACH * fit.radius_sigma, MANUFACTURE * planned)
+                for planned in self.radii
+            )
             and Scene.of(fit.cylinder, self.views, known).support().weaker_share >= least[1]
             and fit.flatness - FLAT <= SURELY * fit.flatness_sigma
         )

@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.thin.thin_pipes import NEARLY_PARALLEL, aligned
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
+from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.thin.thin_pipes import NEARLY_PARALLEL, _LineFitter, aligned, is_shadow
 from pipeprog_detect.types import Cylinder
 from tests.unit.detect.straight_ahead import looking_along_y
 
@@ -43,3 +46,23 @@ def test_what_runs_in_another_direction_in_the_image_is_not_parallel() -> None:
     beside = [level(length, turn=np.radians(8.0)) for length in (1.0, 2.0, 3.0)]
     assert not np.isfinite(aligned(level(0.7), beside, views, 0.1)[1])
     assert not np.isfinite(aligned(level(0.7), [*beside[:2], level(1.0)], views, 0.1)[1])
+
+
+@pytest.mark.parametrize(("apart", "shadow"), [(0.012, True), (0.0155, True), (0.0175, False), (0.04, False)])
+def test_two_pipes_cannot_lie_within_each_other(apart: float, shadow: bool) -> None:
+    beside = level(0.35).shifted(np.array([0.1, 0.0, apart]))
+    assert is_shadow(beside, [level(1.6)]) is shadow
+    assert not is_shadow(beside.shifted(np.array([1.0, 0.0, 0.0])), [level(1.6)])  # beyond its end
+    assert not is_shadow(level(0.35, turn=np.radians(30.0)).shifted(np.array([0.0, 0.01, 0.0])), [level(1.6)])
+
+
+@pytest.mark.parametrize(("sigmas", "stands"), [(1.7, True), (2.9, True), (3.3, False)])
+def test_a_rod_of_another_size_is_no_thin_pipe(sigmas: float, stands: bool) -> None:
+    """The bracket of a clamp, 18 mm square, has two edges as a pipe of 17.2 mm has."""
+    planned, sigma = 0.0086, 1.76e-4
+    boq = BillOfQuantities((PipeClass("copper 17", planned, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    rod = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned + sigmas * sigma)
+    fit = ContourFit(rod, np.eye(5), sigma, 0.9, 20, (0.0, 0.0), 0.0, 0.1)
+    lines = _LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
+    assert lines._accepts(fit, [], (0.6, 0.0)) is stands
