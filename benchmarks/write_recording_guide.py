@@ -68,12 +68,12 @@ ADVICE = {
         "wide.",
     ),
     "rolling shutter [ms]": (
-        "Prefer a camera with a global shutter; of a rolling one, as phones have, tell the read-out time "
-        "(`--set sfm.readout=0.015`, or `readout` in the camera's file), or walk at 0.2 m/s.",
-        "Rows of an image that are read at different times have different poses; without the read-out, the map takes "
-        "them for one.\n"
-        "A board that is skewed by this contradicts its file, and a scale that may be wrong is refused.\n"
-        "This table is of 0.75 m/s and read-outs that are not told; slower walks are under speed.",
+        "Prefer a camera with a global shutter; of a rolling one, as phones have, tell the read-out time where you "
+        "know it (`--set sfm.readout=0.015`, or `readout` in the camera's file), and sway and turn a little as you walk.",
+        "Rows of an image that are read at different times have different poses; a read-out that is not told is taken "
+        "from the images, where the walk's changes of speed and direction tell it ([calibration](calibration.md)).\n"
+        "A board that is skewed contradicts its file, and a scale that may be wrong is refused.\n"
+        "This table is of 0.75 m/s and was measured before read-outs were taken from the images.",
     ),
 }
 COLUMNS = ("right class", "false", "F", "radius RMSE [mm]", "length error [%]", "scale error [%]")
