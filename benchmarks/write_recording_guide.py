@@ -69,7 +69,8 @@ ADVICE = {
     ),
     "rolling shutter [ms]": (
         "Prefer a camera with a global shutter; of a rolling one, as phones have, tell the read-out time where you "
-        "know it (`--set sfm.readout=0.015`, or `readout` in the camera's file), and sway and turn a little as you walk.",
+        "know it (`--set sfm.readout=0.015`, or `readout` in the camera's file), and sway and turn a little as you "
+        "walk.",
         "Rows of an image that are read at different times have different poses; a read-out that is not told is taken "
         "from the images, where the walk's changes of speed and direction tell it ([calibration](calibration.md)).\n"
         "A board that is skewed contradicts its file, and a scale that may be wrong is refused.\n"

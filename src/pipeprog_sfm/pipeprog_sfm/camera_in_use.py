@@ -20,8 +20,9 @@ K2_SHARE = 2.0  # standard deviation of k2 over that of k1: it counts half as mu
 # keyframes, off by a tenth, look like a k1 of 0.005: a guess is worse than that, a calibration is not.
 GUESS = 0.01
 UNKNOWN_READOUT = 0.03  # s, standard deviation of a read-out that is not told: phones have up to 0.035
-# Of a read-out, standard deviation that velocities add, which a spline through the keyframes tells; measured.
-VELOCITY_ERROR = 0.01
+# Of a read-out, the share by which it is off with the velocities, those of a spline through the keyframes: 0.5 % was
+# measured with keyframes every 0.2 s, 2 % where some are a second apart.
+VELOCITY_ERROR = 0.02
 UNDECIDED_READOUT = 0.003  # s, standard deviation above which a phone's read-out, 5 to 30 ms, is not told from 0
 RADIAL_LIMIT = 0.15  # px, mean residual of a ring: systematic errors of features reach 0.03
 

@@ -70,8 +70,8 @@ def test_a_read_out_that_is_not_told_is_found_and_said() -> None:
     assert camera.is_better(first, final=False)
     camera.accept(first)
     assert camera.refined is None  # the calibration stays
-    assert camera.readout_sigma == pytest.approx(0.00015, rel=0.02)
-    assert camera.description().endswith("the read-out is 14.80 ms (sigma 0.15 ms; not told)")
+    assert camera.readout_sigma == pytest.approx(0.0003, rel=0.02)
+    assert camera.description().endswith("the read-out is 14.80 ms (sigma 0.30 ms; not told)")
     assert camera.readout_warning() == ""
 
 
@@ -81,7 +81,7 @@ def test_a_read_out_that_is_told_is_a_prior_and_zero_is_a_fact() -> None:
     assert told.priors(TOLD).sigmas[3] == pytest.approx(0.0036)
     assert told.readout_sigma == 0.0
     told.accept(readout_found(0.015, 0.003, 0.00002))
-    assert "the read-out is 15.00 ms (sigma 0.15 ms; told 12 ms)" in told.description()
+    assert "the read-out is 15.00 ms (sigma 0.30 ms; told 12 ms)" in told.description()
     assert told.priors(TOLD, waiting=True).sigmas[:3].tolist() == [0, 0, 0]  # first the read-out
     assert (CameraInUse(CalibrationConfig(focal_sigma=0.05), 0.012).priors(TOLD, waiting=True).sigmas > 0).all()
     for given in (CameraInUse(CalibrationConfig(), 0.0), CameraInUse(CalibrationConfig(readout_sigma=0.0), 0.012)):
