@@ -134,6 +134,7 @@ def targets() -> dict[str, Target]:
         Target("record3d", ".r3d", partial(_damaged, _archives), _ingest),
         Target("stray_odometry", ".csv", partial(_spoiled_text, _stray_tables), _ingest_stray),
         Target("polycam_camera", ".json", partial(_spoiled_text, _polycam_cameras), _ingest_polycam),
+        Target("photograph", ".jpg", partial(_damaged, _photographs), _ingest_photograph),
         Target("boq", ".yaml", partial(_spoiled_text, _boqs), load_boq),
         Target("boq_csv", ".csv", partial(_spoiled_text, _bill_tables), load_boq),
         Target("boq_xlsx", ".xlsx", partial(_damaged, _workbooks), load_boq),
@@ -271,6 +272,11 @@ def _polycam_cameras() -> list[bytes]:
     with tempfile.TemporaryDirectory() as folder:
         cameras = scans.polycam(Path(folder, "scan")) / "keyframes" / "corrected_cameras"
         return [sorted(cameras.iterdir())[0].read_bytes()]
+
+
+@cache
+def _photographs() -> list[bytes]:
+    return [scans.photograph("2026:11:02 10:00:00", "25", 26, turned) for turned in (1, 6)]
 
 
 @cache
@@ -451,6 +457,16 @@ def _ingest_polycam(path: Path) -> None:
         cameras = scans.polycam(Path(folder, "scan")) / "keyframes" / "corrected_cameras"
         shutil.copy(path, sorted(cameras.iterdir())[0])
         _ingest(Path(folder, "scan"))
+
+
+def _ingest_photograph(path: Path) -> None:
+    """A picture beside one that is right."""
+    with tempfile.TemporaryDirectory() as folder:
+        pictures = Path(folder, "pictures")
+        pictures.mkdir()
+        (pictures / "0.jpg").write_bytes(_photographs()[0])
+        shutil.copy(path, pictures / "1.jpg")
+        _ingest(pictures)
 
 
 def _read_folder(path: Path) -> None:

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.unit.bringup.recordings import CAMERA, STEP, jpeg, pictures
@@ -90,3 +92,17 @@ def record3d(path: Path) -> Path:
             archive.writestr(f"rgbd/{number}.depth", b"bvx2")
         archive.writestr("metadata", json.dumps(told))
     return path
+
+
+def photograph(taken: str = "", fraction: str = "", focal: int = 0, turned: int = 1, width: int = 160) -> bytes:
+    """A JPEG with what EXIF tells of it; nothing where a value is empty."""
+    tags = Image.Exif()
+    own = tags.get_ifd(0x8769)
+    for tag, value in ((0x9003, taken), (0x9291, fraction), (0xA405, focal)):
+        if value:
+            own[tag] = value
+    tags[0x0112] = turned
+    stream = io.BytesIO()
+    picture = np.tile(np.arange(width, dtype=np.uint8), (96, 1))
+    Image.fromarray(np.stack([picture] * 3, -1)).save(stream, "JPEG", exif=tags)
+    return stream.getvalue()

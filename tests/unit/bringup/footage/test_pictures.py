@@ -3,31 +3,17 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from pipeprog_bringup.footage.pictures import picture_files, read_exif
 from pipeprog_bringup.footage.shot import Excerpt
 from pipeprog_bringup.ingest import Request, ingest
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.errors import InputError
-
-
-def photograph(taken: str = "", fraction: str = "", focal: int = 0, turned: int = 1, width: int = 160) -> bytes:
-    tags = Image.Exif()
-    own = tags.get_ifd(0x8769)
-    for tag, value in ((0x9003, taken), (0x9291, fraction), (0xA405, focal)):
-        if value:
-            own[tag] = value
-    tags[0x0112] = turned
-    stream = io.BytesIO()
-    picture = np.tile(np.arange(width, dtype=np.uint8), (96, 1))
-    Image.fromarray(np.stack([picture] * 3, -1)).save(stream, "JPEG", exif=tags)
-    return stream.getvalue()
+from tests.unit.bringup.footage.scans import photograph
 
 
 def ingested(tmp_path: Path, excerpt: Excerpt | None = None) -> tuple[Bag, list[str]]:
