@@ -82,28 +82,19 @@ def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
     smooth = inverse_depth.copy()
     slant = np.zeros((height, width, 2), np.float32)
     for v in prange(height):
+        sums, scratch = np.zeros((10, width)), np.empty((4, width))
+        for i in range(max(0, v - PLANE_RADIUS), min(height, v + PLANE_RADIUS + 1)):
+            for shift in range(-PLANE_RADIUS, PLANE_RADIUS + 1):
+                low, high = max(0, -shift), width - max(0, shift)
+                _add_neighbours(
+                    inverse_depth[v, low:high], inverse_depth[i, low + shift : high + shift],
+                    sigma[i, low + shift : high + shift], float(shift), float(i - v), sums, low, scratch,
+                )  # fmt: skip
         for u in range(width):
             centre = inverse_depth[v, u]
             if not centre > 0.0:
                 continue
-            count, n, su, sv, suu, suv, svv, sw, swu, swv = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for i in range(max(0, v - PLANE_RADIUS), min(height, v + PLANE_RADIUS + 1)):
-                for j in range(max(0, u - PLANE_RADIUS), min(width, u + PLANE_RADIUS + 1)):
-                    w = inverse_depth[i, j] - centre
-                    if not abs(w) < SAME_SURFACE * centre:
-                        continue
-                    du, dv = float(j - u), float(i - v)
-                    p = 1.0 / (sigma[i, j] * sigma[i, j])
-                    count += 1
-                    n += p
-                    su += p * du
-                    sv += p * dv
-                    suu += p * du * du
-                    suv += p * du * dv
-                    svv += p * dv * dv
-                    sw += p * w
-                    swu += p * w * du
-                    swv += p * w * dv
+            n, su, sv, suu, suv, svv, sw, swu, swv, count = sums[:, u]
             cuu, cuv, cvv = suu - su * su / n, suv - su * sv / n, svv - sv * sv / n
             determinant = cuu * cvv - cuv * cuv
             if count >= 6 and determinant > 1e-3 * cuu * cvv:
@@ -114,6 +105,36 @@ def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
                 predicted = OVERLAP / n + FLATNESS * FLATNESS
                 smooth[v, u] = centre + (sw - b * su - c * sv) / n * own / (own + predicted)
     return smooth, slant
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_neighbours(centres, others, sigmas, du, dv, sums, low, scratch):  # type: ignore[no-untyped-def]
+    """Adds to a row's sums (10, width) the pixels (du, dv) away, where they lie on the same surface.
+
+    The pixels in question are `low` and those after it, as many as there are `centres`; scratch (4, width).
+    Loops over the row, each of few arrays, because the compiler makes vector code of these.
+    """
+    size = len(centres)
+    same, away, weight, moment = scratch[0, :size], scratch[1, :size], scratch[2, :size], scratch[3, :size]
+    for u in range(size):
+        w = others[u] - centres[u]
+        near = abs(w) < SAME_SURFACE * centres[u]
+        same[u] = 1.0 if near else 0.0
+        away[u] = w if near else 0.0
+    for u in range(size):
+        weight[u] = 1.0 / (sigmas[u] * sigmas[u]) if same[u] > 0.0 else 0.0
+        moment[u] = weight[u] * away[u]
+    for k, factor in enumerate((1.0, du, dv, du * du, du * dv, dv * dv)):
+        _add_times(weight, factor, sums[k, low : low + size])
+    for k, factor in enumerate((1.0, du, dv)):
+        _add_times(moment, factor, sums[6 + k, low : low + size])
+    _add_times(same, 1.0, sums[9, low : low + size])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_times(values, factor, total):  # type: ignore[no-untyped-def]
+    for u in range(len(total)):
+        total[u] += values[u] * factor
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")

@@ -257,11 +257,13 @@ def _best(sums):  # type: ignore[no-untyped-def]
     for v in prange(height):
         for u in range(width):
             above, below = sums[0, v, u], sums[1, v, u]
-            best, least = 0, np.int32(1 << 30)
+            # The least sum first and then its place: the compiler makes vector code of a loop without places.
+            least = np.int32(1 << 30)
             for d in range(count):
-                value = np.int32(above[d]) + np.int32(below[d])
-                if value < least:
-                    best, least = d, value
+                least = min(least, np.int32(np.int32(above[d]) + np.int32(below[d])))
+            best = 0
+            while np.int32(above[best]) + np.int32(below[best]) != least:
+                best += 1
             if 0 < best < count - 1:
                 before = np.int32(above[best - 1]) + np.int32(below[best - 1])
                 after = np.int32(above[best + 1]) + np.int32(below[best + 1])
