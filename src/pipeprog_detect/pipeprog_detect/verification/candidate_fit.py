@@ -114,6 +114,7 @@ class CandidateFitter:
 
         None where it allows none, or several.
         The other side and the cloud tell its axis; the cloud alone does not tell its radius better than the plan does.
+        Where the cloud resolves the section any support that makes a fit suffices.
         """
         near = self._within_reach(candidate)
         if len(near) != 1:
@@ -121,8 +122,7 @@ class CandidateFitter:
         sigma = _sigma(candidate)
         seen = SeenArc(candidate.evidence.arc, sigma)
         planned = replace(candidate.cylinder, radius=near[0])
-        fit = refine(Start(planned, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
-        return fit if fit is not None and fit.support > CONVINCING else None
+        return refine(Start(planned, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
 
     def strays(self, candidate: Candidate, fit: ContourFit) -> bool:
         """Whether the fit has a radius out of reach of the candidate's: it follows the edges of other things."""
