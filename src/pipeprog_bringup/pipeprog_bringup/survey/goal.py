@@ -57,7 +57,10 @@ def check_goal(survey_id: str, site: Site, reference: str, time_limit: float, no
     """A goal of these fields, given at the time `now` [ns]; raises InputError where one cannot be used."""
     name = _check_name(survey_id) or _name_from_time(now)
     if reference:
-        raise InputError(f"reference {shown(reference)}: surveys are not aligned to earlier ones yet: leave it empty")
+        raise InputError(
+            f"reference {shown(reference)}: a live survey is not aligned with an earlier one yet: leave it empty, and "
+            "replay its recording with --reference"
+        )
     if not 0.0 <= time_limit <= MAX_TIME:
         raise InputError(f"time_limit {time_limit:g} s: give 0 (none) to {MAX_TIME:g} s")
     return Goal(name, site, time_limit)
