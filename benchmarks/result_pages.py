@@ -69,6 +69,14 @@ PAGES = {
         "Out of sight is a pipe of which three keyframes see at most a tenth, in view one of which they see nine "
         "tenths; rightly told as missing can only be pipes thicker than 20 mm in radius.",
     ),
+    "alignment": Page(
+        "Surveys in the frame of an earlier one",
+        ("alignment",),
+        "The second night of a generated lab has a pipe more, one less and one longer, other light and clutter, and no "
+        "board; other rooms are labs of other seeds, furnished alike.\n"
+        "Images of 480 x 270 pixels through the sparse stage alone; the reference lies in the frame of the truth.\n"
+        "The displacement is told at the wall behind the pipes, against the true poses of the second night.",
+    ),
     "board_views": Page(
         "Experiment 1: the scale from few views of the board",
         ("board_views",),
