@@ -12,6 +12,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
@@ -32,18 +33,19 @@ from sitegen.recording import (
     write_truth,
 )
 from sitegen.render import Lens, Scene, build_scene
-from sitegen.robot import Robot, robot_messages
+from sitegen.robot import MAX_RIG, MountedWalk, Robot, mounted, robot_messages
 from sitegen.sensor import Sensor, compress, develop, expose
 from sitegen.site import Site
 from sitegen.visibility import Coverage, coverage, visible_surface
 from sitegen.walk import Walk
 
 _FOCAL_OVER_WIDTH = 0.714  # 70 degrees across, a phone's main camera
-_SIZES = {"480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
+_SIZES = {"vga": (640, 480), "480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
 _PREVIEW_WIDTH = 320  # px; the thinnest pipe is then 2 px wide at 2 m
 _LAB_SECONDS = 16.0
 _MOTION_SEED = 1 << 20  # beyond the numbers of frames, which are their seeds
 _NIGHT_SEED = 1 << 21  # another than those of frames and motion
+_DROP_SEED = 1 << 22
 _SURFACE_VIEWS = 20  # images that contribute true surface points: a million points
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -63,6 +65,7 @@ _BUILDERS = {Layout.lab: build_lab, Layout.field: build_field, Layout.rack: buil
 class Size(str, Enum):
     """Image sizes."""
 
+    vga = "vga"
     p480 = "480p"
     p720 = "720p"
     p1080 = "1080p"
@@ -95,6 +98,9 @@ def make_site(
     focal_error: Annotated[float, typer.Option(help="percent by which CameraInfo's focal length is off")] = 0.0,
     robot: Annotated[bool, typer.Option(help="also a robot's /odom, /imu and /tf_static")] = False,
     odometry_error: Annotated[float, typer.Option(help="percent by which odometry's lengths are off")] = 0.0,
+    rig: Annotated[int, typer.Option(help="cameras of the robot, with --robot", min=1, max=MAX_RIG)] = 1,
+    drop: Annotated[float, typer.Option(help="share of the images that get lost", min=0, max=0.9)] = 0.0,
+    grey: Annotated[bool, typer.Option(help="grey images")] = False,
     surface: Annotated[bool, typer.Option(help="also NAME.surface.npz: true surface points and their pipes")] = False,
     board_error_mm: Annotated[float, typer.Option(help="standard deviation of a printed circle's place", min=0)] = 0.0,
     allow_hidden: Annotated[bool, typer.Option(help="accept a recording that does not show every pipe")] = False,
@@ -135,12 +141,15 @@ def make_site(
         np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
     # The recording is written last: where it exists, all files that belong to it exist, too.
     sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain, site.balance)
-    frames = _frames(Shot(scene, lens, walk, sensor), times, seed + _NIGHT_SEED * second_night_later, jobs)
+    walks: list[Walk | MountedWalk] = [walk, *(MountedWalk(walk, mounted(number)) for number in range(1, rig))]
+    shots = [Shot(scene, lens, each, sensor, grey) for each in walks]
+    taken = _taken(times, rig, drop, np.random.default_rng([seed, _DROP_SEED]))
+    frames = _frames(shots, taken, seed + _NIGHT_SEED * second_night_later, jobs)
     motion_rng = np.random.default_rng([seed, _MOTION_SEED])
-    motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng)
-    shown = track(frames, total=len(times), description=out.name, console=console)
+    motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng, rig)
+    shown = track(frames, total=len(taken), description=out.name, console=console)
     write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown, motion if robot else ())
-    console.print(f"{out}: {len(times)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
+    console.print(f"{out}: {len(taken)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
 
 
 @dataclass(frozen=True)
@@ -149,25 +158,35 @@ class Shot:
 
     scene: Scene
     lens: Lens
-    walk: Walk
+    walk: Walk | MountedWalk
     sensor: Sensor
+    is_grey: bool = False
 
     def jpeg(self, time: float, rng: np.random.Generator) -> bytes:
         """The frame at a time, s, with noise from `rng`."""
         linear = expose(self.scene, self.lens, self.walk, self.sensor, time)
-        return compress(develop(linear, self.sensor, rng), self.sensor)
+        image = develop(linear, self.sensor, rng)
+        return compress(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if self.is_grey else image, self.sensor)
 
 
-def _frames(shot: Shot, times: NDArray[np.float64], seed: int, jobs: int) -> Iterator[tuple[int, bytes]]:
-    """Stamps and JPEGs in order; `jobs` frames at a time, each with noise of its own seed."""
+def _taken(times: NDArray[np.float64], cameras: int, drop: float, rng: np.random.Generator) -> list[tuple[float, int]]:
+    """Time and number of the camera of each image that does not get lost."""
+    taken = [(float(time), camera) for time in times for camera in range(cameras)]
+    return [each for each, kept in zip(taken, rng.random(len(taken)) >= drop, strict=True) if kept]
 
-    def make(index: int) -> tuple[int, bytes]:
-        time = float(times[index])
-        return FIRST_STAMP + round(time * 1e9), shot.jpeg(time, np.random.default_rng([seed, index]))
+
+def _frames(
+    shots: Sequence[Shot], taken: Sequence[tuple[float, int]], seed: int, jobs: int
+) -> Iterator[tuple[int, int, bytes]]:
+    """Stamps, cameras and JPEGs in order; `jobs` frames at a time, each with noise of its own seed."""
+
+    def make(index: int) -> tuple[int, int, bytes]:
+        time, camera = taken[index]
+        return FIRST_STAMP + round(time * 1e9), camera, shots[camera].jpeg(time, np.random.default_rng([seed, index]))
 
     with ThreadPoolExecutor(jobs) as pool:
-        for first in range(0, len(times), jobs):
-            yield from pool.map(make, range(first, min(first + jobs, len(times))))
+        for first in range(0, len(taken), jobs):
+            yield from pool.map(make, range(first, min(first + jobs, len(taken))))
 
 
 def lens_of(size: Size, distortion: str, focal_over_width: float = _FOCAL_OVER_WIDTH) -> Lens:

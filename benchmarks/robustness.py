@@ -77,7 +77,7 @@ class Shot:
             lens = Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
             info = camera_info(replace(lens, distortion=(self.k1, 0.0, 0.0, 0.0, 0.0)), self.focal_error / 100, False)
             rng = np.random.default_rng(SEED)
-            write_bag(target, info, ((frame.stamp, self._image(frame.data, rng)) for frame in bag))
+            write_bag(target, info, ((frame.stamp, 0, self._image(frame.data, rng)) for frame in bag))
         return Recording(target, f"{plain.made_by}, then by benchmarks.robustness: {said}")
 
     def _image(self, message: bytes, rng: np.random.Generator) -> bytes:

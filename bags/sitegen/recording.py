@@ -15,12 +15,11 @@ from mcap_ros2.writer import Writer
 from numpy.typing import NDArray
 
 from sitegen.render import Lens
-from sitegen.robot import CAMERA_FRAME, RobotMessage
+from sitegen.robot import RobotMessage, camera_frame
 from sitegen.site import BOARD_CENTRES, BOARD_CIRCLE_RADIUS, CLASSES, Site
 
 FloatArray = NDArray[np.float64]
 
-FRAME_ID = CAMERA_FRAME
 FIRST_STAMP = 1_700_000_000_000_000_000
 _SECOND = 1_000_000_000
 
@@ -81,9 +80,11 @@ def camera_info(lens: Lens, focal_error: float, leave_out_distortion: bool) -> d
 
 
 def write_bag(
-    path: Path, info: dict[str, Any], frames: Iterable[tuple[int, bytes]], motion: Iterable[RobotMessage] = ()
+    path: Path, info: dict[str, Any], frames: Iterable[tuple[int, int, bytes]], motion: Iterable[RobotMessage] = ()
 ) -> None:
-    """Write (stamp in ns, JPEG bytes) with one CameraInfo each, at equal stamps; a file under its name is complete.
+    """Write (stamp in ns, number of the camera, JPEG bytes) with one CameraInfo each, at equal stamps.
+
+    A file under its name is complete.
 
     `motion` are the messages of a robot, in order of time.
     """
@@ -99,13 +100,14 @@ def write_bag(
                 one = waiting.popleft()
                 writer.write_message(one.topic, schemas[one.type_name], one.message, one.stamp, one.stamp)
 
-        for sequence, (stamp, data) in enumerate(frames):
+        for sequence, (stamp, camera, data) in enumerate(frames):
             write_motion(stamp)
-            header = {"stamp": {"sec": stamp // _SECOND, "nanosec": stamp % _SECOND}, "frame_id": FRAME_ID}
+            header = {"stamp": {"sec": stamp // _SECOND, "nanosec": stamp % _SECOND}, "frame_id": camera_frame(camera)}
+            topic = f"/camera{camera or ''}"
             times = {"log_time": stamp, "publish_time": stamp, "sequence": sequence}
-            writer.write_message("/camera/camera_info", info_schema, {"header": header, **info}, **times)
+            writer.write_message(f"{topic}/camera_info", info_schema, {"header": header, **info}, **times)
             image = {"header": header, "format": "jpeg", "data": data}
-            writer.write_message("/camera/image/compressed", image_schema, image, **times)
+            writer.write_message(f"{topic}/image/compressed", image_schema, image, **times)
         write_motion(math.inf)
     part.replace(path)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from sitegen.walk import Walk
@@ -20,6 +20,10 @@ ODOMETRY_HZ, IMU_HZ = 50.0, 100.0
 # The camera on a robot's front, looking to its left, where the walks have their walls: x ahead, y down, z left.
 BASE_FROM_CAMERA = np.array([[1.0, 0, 0, 0.30], [0, 0, 1.0, 0.05], [0, -1.0, 0, 0.45], [0, 0, 0, 1.0]])
 CAMERA_FRAME = "camera_optical"
+# The cameras of a rig as the first one has them: m along the walk (x), and degrees by which they look aside. As on
+# Spot, neighbours see the same wall from a hand's breadth apart and from different sides.
+_RIG = ((0.0, 0.0), (0.25, -20.0), (-0.25, 20.0), (0.12, 12.0), (-0.12, -12.0))
+MAX_RIG = len(_RIG)
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,32 @@ class Robot:
 
 
 @dataclass(frozen=True)
+class MountedWalk:
+    """The walk of another camera of the robot, mounted at first_from_camera (4, 4)."""
+
+    walk: Walk
+    first_from_camera: FloatArray
+
+    def poses(self, seconds: ArrayLike) -> FloatArray:
+        """(N, 4, 4) world_from_camera (optical frame) at (N,) times."""
+        return self.walk.poses(seconds) @ self.first_from_camera
+
+
+def mounted(number: int) -> FloatArray:
+    """first_from_camera (4, 4) of the camera of this number, 0 to MAX_RIG - 1."""
+    along, degrees = _RIG[number]
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    pose[0, 3] = along
+    return pose
+
+
+def camera_frame(number: int) -> str:
+    """The optical frame of the camera of this number."""
+    return CAMERA_FRAME if number == 0 else f"camera{number}_optical"
+
+
+@dataclass(frozen=True)
 class RobotMessage:
     """One message: topic, type, content as plain values, stamp in ns."""
 
@@ -50,11 +80,14 @@ class RobotMessage:
 
 
 def robot_messages(
-    walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator
+    walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator, cameras: int = 1
 ) -> Iterator[RobotMessage]:
     """Messages in order of time: /tf_static, then /odom and /imu from shortly before the first frame on."""
-    mounted = _transform("base_link", CAMERA_FRAME, BASE_FROM_CAMERA, first_stamp)
-    yield RobotMessage("/tf_static", "tf2_msgs/msg/TFMessage", {"transforms": [mounted]}, first_stamp)
+    edges = [
+        _transform("base_link", camera_frame(number), BASE_FROM_CAMERA @ mounted(number), first_stamp)
+        for number in range(cameras)
+    ]
+    yield RobotMessage("/tf_static", "tf2_msgs/msg/TFMessage", {"transforms": edges}, first_stamp)
     messages = [*_odometry(walk, robot, seconds, first_stamp, rng), *_imu(walk, robot, seconds, first_stamp, rng)]
     yield from sorted(messages, key=lambda message: message.stamp)
 

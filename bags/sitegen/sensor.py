@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitegen.render import NEUTRAL, Colour, FloatImage, Lens, Scene, render
+from sitegen.robot import MountedWalk
 from sitegen.walk import Walk
 
 _BLUR_STEP = 0.7  # px between the sub-frames of a blurred frame: less than the lens blur, so that no copies show
@@ -28,7 +29,7 @@ class Sensor:
     balance: Colour = NEUTRAL  # factors on red, green and blue
 
 
-def expose(scene: Scene, lens: Lens, walk: Walk, sensor: Sensor, time: float) -> FloatImage:
+def expose(scene: Scene, lens: Lens, walk: Walk | MountedWalk, sensor: Sensor, time: float) -> FloatImage:
     """Linear image of the frame whose middle row is at the middle of its exposure at `time`."""
     rows = ((np.arange(lens.height) + 0.5) / lens.height - 0.5) * sensor.readout
     times = [0.0]

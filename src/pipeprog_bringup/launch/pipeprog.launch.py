@@ -39,6 +39,12 @@ ARGUMENTS = [
         description="Topic of the camera's calibration, sensor_msgs/CameraInfo. K = 0 is refused.",
     ),
     DeclareLaunchArgument(
+        "cameras",
+        default_value="",
+        description="Several cameras of a robot, in place of image and camera_info: what their topics begin with, "
+        "between spaces, such as '/spot/camera/frontleft /spot/camera/frontright'. /tf_static says where they are.",
+    ),
+    DeclareLaunchArgument(
         "odometry",
         default_value="odometry",
         description="Topic of the robot's odometry, nav_msgs/Odometry: a source of scale. /tf_static says where the "
@@ -114,7 +120,7 @@ def truth(argument: str) -> ParameterValue:
 
 def survey_node(remappings: list) -> LifecycleNode:
     """The managed node of the action; it is configured and activated by a lifecycle manager, or by hand."""
-    files = {name: text(name) for name in ("boq", "board")}
+    files = {name: text(name) for name in ("boq", "board", "cameras")}
     return LifecycleNode(
         package="pipeprog_bringup",
         executable="survey_node",
@@ -146,7 +152,15 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *ARGUMENTS,
-            pipeprog_node("frames", {"image_transport": text("image_transport"), "idle": truth("survey")}, camera),
+            pipeprog_node(
+                "frames",
+                {
+                    "image_transport": text("image_transport"),
+                    "cameras": text("cameras"),
+                    "idle": truth("survey"),
+                },
+                camera,
+            ),
             pipeprog_node("sfm", {"board": text("board")}, motion),
             pipeprog_node("detect", {"boq": text("boq")}, []),
             survey_node(camera + motion),

@@ -55,6 +55,7 @@ class Request:
     imu_topic: str | None = None
     with_cloud: bool = True
     reference: Path | None = None
+    rig: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,9 +90,11 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
     check_room(request.bag)
     inputs = _read(request)
     with OutputFolder(request.out, request.force) as folder, scratch_folder() as scratch:
-        if faults := faults_of(inputs.bag, inputs.board_file):
-            raise InputError("; ".join(faults))
+        faults = [faults_of(camera, inputs.board_file) for camera in inputs.bag.rig or (inputs.bag,)]
+        if all(faults):
+            raise InputError("; ".join(faults[0]))
         parameters = _parameters(request, inputs.configs, folder.file("colmap"))
+        parameters["frames"]["cameras"] = " ".join(camera.frame_id for camera in inputs.bag.rig)
         session = Session(inputs.bag, request.rate, report)
         with private_network(scratch), Graph(parameters, scratch, modules) as graph, _ros():
             survey, status = session.run(graph)
@@ -125,9 +128,13 @@ def replay(request: Request, report: Callable[[State], None], modules: dict[str,
 
 def _read(request: Request) -> _Inputs:
     """Read what the request names; raises InputError where something of it cannot be used."""
-    bag = Bag.open(
-        request.bag, request.image_topic, request.camera_info_topic, request.odometry_topic, request.imu_topic
-    )
+    if request.rig and (request.image_topic or request.camera_info_topic):
+        raise InputError("--rig takes all cameras: leave --image-topic and --camera-info-topic out")
+    motion = request.odometry_topic, request.imu_topic
+    if request.rig:
+        bag = Bag.open_rig(request.bag, *motion)
+    else:
+        bag = Bag.open(request.bag, request.image_topic, request.camera_info_topic, *motion)
     boq = load_boq(request.boq)
     board_file = load_board_file(request.board) if request.board else BoardFile()
     if request.rate is not None and not request.rate > 0:
@@ -175,6 +182,7 @@ def _settings(request: Request, inputs: _Inputs) -> dict[str, Any]:
             "bag": str(request.bag),
             "image_topic": inputs.bag.image_topic,
             "camera_info_topic": inputs.bag.camera_info_topic,
+            "rig": [camera.image_topic for camera in inputs.bag.rig],
             "motion_topics": inputs.bag.motion_topics,
             "rate": request.rate,
             **({"reference": str(request.reference)} if request.reference else {}),

@@ -12,6 +12,7 @@ from pipeprog_frames.tracker import Track
 NAN = float("nan")
 DAMAGED = "damaged image"
 UNCALIBRATED = "calibration: no usable CameraInfo has come"
+FOREIGN = "calibration: the camera is none of the rig's"
 OTHER_SIZE = "size differs from CameraInfo"
 FAULTS = (
     "damaged",
@@ -37,6 +38,7 @@ class Decision:
         overlap: with the last keyframe, 0 to 1; NaN: not measured.
         parallax: median against the last keyframe, px of the full image; NaN: not measured.
         sharpness: mean squared Laplacian of the reduced image; NaN: not measured.
+        frame_id: of its camera in a rig; empty: of the one camera.
     """
 
     stamp: int
@@ -45,6 +47,7 @@ class Decision:
     overlap: float = NAN
     parallax: float = NAN
     sharpness: float = NAN
+    frame_id: str = ""
 
 
 @dataclass

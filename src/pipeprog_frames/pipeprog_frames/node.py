@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +17,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_NAME
+from pipeprog_camera.rig import unique_stamp
 from pipeprog_frames.acknowledgements import MAX_AHEAD, Answer, Ledger
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import DAMAGED, FAULTS, UNCALIBRATED, Decision
@@ -23,7 +25,8 @@ from pipeprog_frames.incoming.arrival import MAX_QUEUE, Arrival, ArrivalQueue
 from pipeprog_frames.incoming.decoding import decode_reduced, reduce_image
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame
 from pipeprog_frames.overlap_feedback import OverlapReport
-from pipeprog_frames.selection import Selected, Selection
+from pipeprog_frames.rig_selection import ONE, RigSelection
+from pipeprog_frames.selection import Selected
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
 from pipeprog_node import messages, qos, received_images, received_keyframes
 from pipeprog_node.diagnostics import Diagnostics
@@ -33,6 +36,7 @@ from pipeprog_node.intake import Intake
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
 
+ArrivedCalibration = tuple[str, int, Camera | None]  # name of its camera, stamp [ns], None where it cannot be used
 STAGES = 2  # nodes of the graph that take keyframes: SfM and detector
 
 
@@ -96,51 +100,67 @@ class FrameInput:
         node: Node,
         config: FramesConfig,
         on_image: Callable[[Arrival], None],
-        on_calibration: Callable[[tuple[int, Camera | None]], None],
+        on_calibration: Callable[[ArrivedCalibration], None],
         on_answer: Callable[[Answer], None],
-        idle: bool,
+        cameras: Sequence[str],
     ) -> None:
-        """`idle`: without the topics of the camera."""
+        """`cameras`: names of those whose topics are subscribed; see `_subscribe`."""
         self.intake = Intake(node)
         self._overlaps = self.intake.subscribe(ImageOverlapArray, "image_overlap", _answer, on_answer, qos.reliable(50))
-        if not idle:
-            self._subscribe_camera(config, on_image, on_calibration)
+        if config.lockstep and len(cameras) > 1:
+            # Topics are not ordered among each other: a player sends all cameras on one, and their frames tell them.
+            self._subscribe(config, "", None, on_image, on_calibration, MAX_QUEUE * len(cameras))
+            return
+        for number, name in enumerate(cameras):
+            prefix = f"{name}/" if name != ONE else ""
+            self._subscribe(config, prefix, (name, number), on_image, on_calibration)
 
-    def _subscribe_camera(
+    def _subscribe(
         self,
         config: FramesConfig,
+        prefix: str,
+        camera: tuple[str, int] | None,
         on_image: Callable[[Arrival], None],
-        on_calibration: Callable[[tuple[int, Camera | None]], None],
+        on_calibration: Callable[[ArrivedCalibration], None],
+        depth: int = MAX_QUEUE,
     ) -> None:
+        """The topics that begin with `prefix`: of a camera with this name and number, None: of all cameras."""
         # Live, a late image is worth less than a fresh one; a recording must lose none.
-        source = qos.reliable(MAX_QUEUE) if config.lockstep else qos.sensor(10)
+        source = qos.reliable(depth) if config.lockstep else qos.sensor(10)
         subscribe = partial(self.intake.subscribe, profile=source, overriding=qos.OVERRIDABLE)
-        subscribe(CameraInfo, "camera_info", self._calibration, on_calibration)
-        if config.image_transport != "raw":
-            subscribe(CompressedImage, "image/compressed", partial(self._arrival, "image/compressed"), on_image)
+        info, raw = f"{prefix}camera_info", f"{prefix}image"
+        # spot_ros2 has camera/frontleft/compressed beside camera/frontleft/image.
+        encoded = [f"{raw}/compressed", *([f"{prefix}compressed"] if prefix else [])]
+        subscribe(CameraInfo, info, partial(self._calibration, info, camera), on_calibration)
+        for compressed in encoded if config.image_transport != "raw" else ():
+            subscribe(CompressedImage, compressed, partial(self._arrival, compressed, camera), on_image)
         if config.image_transport != "compressed":
-            subscribe(Image, "image", partial(self._arrival, "image"), on_image)
+            subscribe(Image, raw, partial(self._arrival, raw, camera), on_image)
 
     @property
     def is_connected(self) -> bool:
         """Whether an SfM answers."""
         return self._overlaps.get_publisher_count() > 0
 
-    def _calibration(self, message: CameraInfo) -> tuple[int, Camera | None]:
+    def _calibration(self, topic: str, camera: tuple[str, int] | None, message: CameraInfo) -> ArrivedCalibration:
+        name, number = camera or (message.header.frame_id[:MAX_NAME], 0)
         try:
             info = received_images.camera_info(message)
         except InputError as error:
-            self.intake.reject("camera_info", error)
-            return messages.stamp_ns(message.header.stamp), None
-        return info.stamp, info.camera
+            self.intake.reject(topic, error)
+            return name, unique_stamp(messages.stamp_ns(message.header.stamp), number), None
+        return name, unique_stamp(info.stamp, number), info.camera
 
-    def _arrival(self, topic: str, message: Image | CompressedImage) -> Arrival:
+    def _arrival(self, topic: str, camera: tuple[str, int] | None, message: Image | CompressedImage) -> Arrival:
+        name, number = camera or (message.header.frame_id[:MAX_NAME], 0)
         try:
-            return _compressed(message) if isinstance(message, CompressedImage) else _raw(message)
+            arrival = _compressed(message) if isinstance(message, CompressedImage) else _raw(message)
         except InputError as error:
             self.intake.reject(topic, error)
             header = message.header
-            return Arrival(messages.stamp_ns(header.stamp), header.frame_id[:MAX_NAME], refusal=f"{DAMAGED}: {error}")
+            stamp = messages.stamp_ns(header.stamp)
+            arrival = Arrival(stamp, header.frame_id[:MAX_NAME], refusal=f"{DAMAGED}: {error}")
+        return arrival if name == ONE else replace(arrival, stamp=unique_stamp(arrival.stamp, number), camera=name)
 
 
 class FramesNode(Node):
@@ -148,12 +168,13 @@ class FramesNode(Node):
 
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("frames", parameter_overrides=list(overrides))
-        self._config = declare(self, FramesConfig, extra=("idle",))
+        self._config = declare(self, FramesConfig, extra=("idle", "cameras"))
         idle = declare_fixed(self, "idle", False, "take no images, until a survey begins")
         if self._config.policy == "network" and not self._config.lockstep:
             raise InputError("policy = network takes a whole recording: use it with `pipeprog replay`, live use stream")
-        self._selection = Selection(self._config)
-        self._queue = ArrivalQueue(lossless=self._config.lockstep)
+        cameras = declare_fixed(self, "cameras", "", "what the topics of a rig begin with, between spaces; empty: one")
+        self._selection = RigSelection(self._config, cameras.split())
+        self._queue = ArrivalQueue(self._config.lockstep, MAX_QUEUE * len(self._selection.names))
         self._changes: deque[EncodedFrame | list[int]] = deque()  # keyframes to publish; stamps of some to retire
         self._ledger = Ledger(exact=self._config.lockstep)
         self._considered = self._dropped = 0
@@ -162,14 +183,21 @@ class FramesNode(Node):
         self._frame_id = ""  # of the camera, as its last image says
 
         self._publisher = KeyframePublisher(self)
-        self._input = FrameInput(self, self._config, self._on_image, self._on_calibration, self._on_answer, idle)
+        self._input = FrameInput(
+            self,
+            self._config,
+            self._on_image,
+            self._on_calibration,
+            self._on_answer,
+            () if idle else self._selection.names,
+        )
         if self._config.lockstep:
             self._connecting = self.create_timer(0.1, self._start_when_connected)
         self._finish = FinishService(self, lambda: self._considered + len(self._queue), self._on_finish)
         self._diagnostics = Diagnostics(self, "keyframes", self._health)
 
-    def _on_calibration(self, calibration: tuple[int, Camera | None]) -> None:
-        self._selection.calibrations.add(*calibration)
+    def _on_calibration(self, calibration: ArrivedCalibration) -> None:
+        self._selection.calibrate(*calibration)
         self._drain()
 
     def _on_image(self, arrival: Arrival) -> None:
@@ -177,15 +205,16 @@ class FramesNode(Node):
             return  # the survey ended with the images before: a camera goes on for ever
         dropped = self._queue.push(arrival)
         self._dropped += len(dropped)
-        reason = "dropped: newer images had come" if self._selection.calibrations.newest else UNCALIBRATED
+        uncalibrated = self._selection.uncalibrated
         for each in dropped:
             self._considered += 1
-            self._decide([(Decision(each.stamp, False, each.refusal or reason), None)])
+            reason = UNCALIBRATED if each.camera in uncalibrated else "dropped: newer images had come"
+            self._decide([(Decision(each.stamp, False, each.refusal or reason, frame_id=each.frame_id), None)])
         self._drain()
-        if self._selection.calibrations.newest is None:
+        if arrival.camera in uncalibrated:
+            topic = self.resolve_topic_name(f"{arrival.camera}/camera_info" if arrival.camera else "camera_info")
             self.get_logger().warning(
-                f"images without CameraInfo: publish the calibration on {self.resolve_topic_name('camera_info')}",
-                throttle_duration_sec=10.0,
+                f"images without CameraInfo: publish the calibration on {topic}", throttle_duration_sec=10.0
             )
 
     def _start_when_connected(self) -> None:
@@ -232,10 +261,11 @@ class FramesNode(Node):
 
     def _is_ready(self, arrival: Arrival) -> bool:
         """Whether an image can be decided on. Live, one without a calibration of its size waits for the next image."""
-        calibrations = self._selection.calibrations
-        if arrival.refusal or calibrations.is_known(arrival.stamp, arrival.size):
+        selection = self._selection
+        if selection.is_ready(arrival):
             return True
-        waited = self._finish.is_due or (len(self._queue) > 1 and calibrations.newest is not None)
+        cameras = len(selection.names)
+        waited = self._finish.is_due or (len(self._queue) > cameras > len(selection.uncalibrated))
         return waited and not self._config.lockstep
 
     def _end(self) -> None:
@@ -253,7 +283,7 @@ class FramesNode(Node):
         for decision, frame in selected:
             if decision.reason.startswith(FAULTS):
                 self._note_fault(decision)
-            self._publisher.announce(decision, self._frame_id)
+            self._publisher.announce(decision, decision.frame_id or self._frame_id)
             if frame is not None:
                 self._changes.append(frame)
 
@@ -305,8 +335,9 @@ class FramesNode(Node):
             **{f"frames refused: {fault}": count for fault, count in sorted(self._faults.items())},
             **self._input.intake.health(),
         }
-        if self._selection.calibrations.newest is None:
-            return DiagnosticStatus.WARN, "no usable CameraInfo yet", values
+        if uncalibrated := self._selection.uncalibrated:
+            of = f" of {', '.join(uncalibrated)}" if any(uncalibrated) else ""
+            return DiagnosticStatus.WARN, f"no usable CameraInfo yet{of}", values
         if self._selection.overlap_min < self._config.overlap_min:
             fewer = f"fewer keyframes, at an overlap of {self._selection.overlap_min:.2f}"
             return DiagnosticStatus.WARN, f"the SfM cannot keep up: {fewer}", values

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -101,6 +102,9 @@ class Stage:
         self.spin_until(lambda: self._counted("frames considered") > considered)
         self.spin_until(lambda: len(self.keyframes) == self._counted("keyframes"))
 
+    def has_considered(self, more_than: int) -> bool:
+        return self._counted("frames considered") > more_than
+
     def _counted(self, what: str) -> int:
         return int(self.node._health()[2][what])
 
@@ -148,6 +152,31 @@ def report(stamp: int, overlap: float, before: int, after: int) -> ImageOverlap:
         matches_previous=before,
         matches_next=after,
     )
+
+
+def test_cameras_that_are_triggered_together_have_stamps_of_their_own(
+    stage: Callable[..., Stage], wall: NDArray
+) -> None:
+    """Equal stamps, which the SfM and the detector know keyframes by; live, each camera has its topics."""
+    scene = stage("-p", "cameras:=left right", image="left/image/compressed", camera_info="left/camera_info")
+    others = scene.others
+    images = others.create_publisher(CompressedImage, "right/image/compressed", qos.reliable(10))
+    infos = others.create_publisher(CameraInfo, "right/camera_info", qos.reliable(10))
+    scene.spin_until(lambda: images.get_subscription_count() and infos.get_subscription_count())
+    for index in range(16):
+        stamp = START + index * 200_000_000
+        considered = scene._counted("frames considered")
+        infos.publish(messages.info_from_camera(CAMERA, stamp, "right_optical"))
+        images.publish(compressed(stamp, view(wall, 3000 - 30 * index), frame="right_optical"))
+        scene.spin_until(partial(scene.has_considered, considered))
+        scene.show(stamp, compressed(stamp, view(wall, 30 * index), frame="left_optical"))
+    of = {messages.stamp_ns(message.header.stamp): message.header.frame_id for message in scene.keyframes}
+    assert len(of) == len(scene.keyframes)
+    assert {stamp % 10 for stamp, frame in of.items() if frame == "left_optical"} == {0}
+    assert {stamp % 10 for stamp, frame in of.items() if frame == "right_optical"} == {1}
+    scene.spin_until(lambda: len(scene.decisions) >= 2 * 10)
+    told = {(messages.stamp_ns(one.header.stamp) % 10, one.header.frame_id) for one in scene.decisions}
+    assert told == {(0, "left_optical"), (1, "right_optical")}
 
 
 def test_one_of_several_grey_cameras_with_irregular_stamps(stage: Callable[..., Stage], wall: NDArray) -> None:

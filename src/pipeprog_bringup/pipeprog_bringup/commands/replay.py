@@ -46,6 +46,9 @@ def replay(
     force: Force = False,
     image_topic: ImageTopic = None,
     camera_info_topic: CameraInfoTopic = None,
+    rig: Annotated[
+        bool, typer.Option("--rig", help="Use all cameras of a robot; /tf_static says where they are mounted.")
+    ] = False,
     odometry_topic: OdometryTopic = None,
     imu_topic: ImuTopic = None,
     progress: Annotated[
@@ -97,6 +100,7 @@ def replay(
         imu_topic,
         not no_cloud,
         reference,
+        rig,
     )
     with replay_bars(quiet) as show, state_file(progress, show) as report:
         outcome = run(request, report)

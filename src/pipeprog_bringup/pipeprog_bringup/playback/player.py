@@ -21,8 +21,8 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_SMALL_MESSAGE
 from pipeprog_node import messages, qos
 
-# Frames sent and not decided on, at most; more than frames.window (6 at most) and the frames that are held until the
-# next ones confirm their stamps (2) together, or the selector would wait.
+# Frames of a camera sent and not decided on, at most; more than frames.window (6 at most) and the frames that are held
+# until the next ones confirm their stamps (2) together, or the selector would wait.
 IN_FLIGHT = 10
 KEPT = 1000  # messages of motion, ten times what is ever on its way (MOTION_IN_FLIGHT)
 MAX_GAP = 60.0  # s of the recording between two frames that a rate is held for; a stamp may be years off
@@ -38,8 +38,9 @@ class Player:
         self._bag, self._log = bag, log
         self.motion_sent = 0  # messages; one of TF counts for each of its transforms, as in SfmStatus
         image_type, image_topic = IMAGE_TYPES[bag.image_type]
-        self._images = node.create_publisher(image_type, image_topic, qos.reliable(4 * IN_FLIGHT))
-        self._infos = node.create_publisher(CameraInfo, "camera_info", qos.reliable(4 * IN_FLIGHT))
+        self._in_flight = IN_FLIGHT * max(len(bag.rig), 1)
+        self._images = node.create_publisher(image_type, image_topic, qos.reliable(4 * self._in_flight))
+        self._infos = node.create_publisher(CameraInfo, "camera_info", qos.reliable(4 * self._in_flight))
         self._motion = {
             topic: node.create_publisher(kind, topic, qos.kept(KEPT) if topic == TF_STATIC else qos.reliable(KEPT))
             for topic, kind in MOTION_TYPES.items()
@@ -49,7 +50,7 @@ class Player:
         self.motion_topics = list(self._motion)
 
     def play(self, rate: float | None, spin: Callable[[float], None], pause: Callable[[float], None]) -> int:
-        """Send every frame, at most IN_FLIGHT ahead of the selector; returns the number sent.
+        """Send every frame, at most IN_FLIGHT of each camera ahead of the selector; returns the number sent.
 
         With `rate` at that multiple of real time, with None as fast as the nodes take the frames. `spin(seconds)`
         handles what the nodes answer, `pause(due)` does so until the time `due` of time.monotonic. Raises InputError
@@ -64,7 +65,7 @@ class Player:
             if message.fault:
                 self._log.skip(message.stamp, message.fault)
                 continue
-            while self._log.in_flight >= IN_FLIGHT:
+            while self._log.in_flight >= self._in_flight:
                 spin(0.1)
             if rate is not None:
                 gap = 0 if previous is None else message.stamp - previous

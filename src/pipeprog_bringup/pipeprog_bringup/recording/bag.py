@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -19,11 +19,20 @@ from pipeprog_bringup.recording.mcap_file import McapFile
 from pipeprog_bringup.recording.message_file import MessageFile, messages_of, tagged_messages
 from pipeprog_bringup.recording.ros1_file import Ros1File
 from pipeprog_bringup.recording.sqlite_file import SqliteFile
-from pipeprog_bringup.recording.topic_choice import IMAGE_TYPES, TF_STATIC, choose_camera, choose_motion
+from pipeprog_bringup.recording.topic_choice import (
+    IMAGE_TYPES,
+    TF_STATIC,
+    choose_camera,
+    choose_motion,
+    image_frame,
+    rig_topics,
+)
 from pipeprog_bringup.recording.video_stream import VideoStream, video_codec
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_TRIED_IMAGES
+from pipeprog_camera.outside_text import shown
+from pipeprog_camera.rig import unique_stamp
 from pipeprog_camera.rolling_shutter import check_readout
 
 _USED_TYPES = {*IMAGE_TYPES, cdr.CAMERA_INFO, cdr.ODOMETRY, cdr.IMU, cdr.TF}
@@ -58,6 +67,8 @@ class Bag:
     _left_out: Counter[str]  # messages of the last pass that are damaged, by topic
     _recorded_type: str  # of the image topic; other than image_type where it is video
     _codec: str  # of that video; empty: pictures
+    frame_id: str = ""  # of the first image
+    rig: tuple[Bag, ...] = ()  # all cameras, this one first; empty: one camera
 
     @classmethod
     def open(
@@ -80,6 +91,7 @@ class Bag:
         first_calibration, camera = _first_camera(path, info_topic, infos)
         images = (message.data for message in messages_of(files, {image_topic}))
         codec = video_codec(image_topic, types[image_topic], images)
+        frame_id = image_frame(files, image_topic, types[image_topic])
         motion, notes = choose_motion(path, types, odometry_topic, imu_topic)
         motion_types = {topic: types[topic] for topic in motion}
         bag = cls(
@@ -97,9 +109,28 @@ class Bag:
             Counter(),
             types[image_topic],
             codec,
+            frame_id,
         )
         bag._check_images()
         return bag
+
+    @classmethod
+    def open_rig(cls, path: Path, odometry_topic: str | None = None, imu_topic: str | None = None) -> Bag:
+        """All cameras of a recording as one rig; the first one stands for it. Raises InputError as `open`."""
+        files = tuple(_opened(part) for part in parts(path))
+        counts, types = _topics(files, path)
+        pairs = rig_topics(path, files, counts, types)
+        rig = tuple(cls.open(path, image, info, odometry_topic, imu_topic) for image, info in pairs)
+        frames = [bag.frame_id for bag in rig]
+        if len(rig) > 1 and (len(set(frames)) < len(rig) or any(frame.split() != [frame] for frame in frames)):
+            raise InputError(
+                f"{path}: the frame_id of the cameras {', '.join(bag.image_topic for bag in rig)} is "
+                f"{', '.join(map(shown, frames))}: give each camera one of its own, or choose one with --image-topic"
+            )
+        if len({bag.image_type for bag in rig}) > 1 or any(bag._codec for bag in rig):
+            raise InputError(f"{path}: a rig's cameras send all JPEG or PNG, or all raw images: choose --image-topic")
+        count = sum(bag.image_count for bag in rig)
+        return replace(rig[0], image_count=count, rig=rig) if len(rig) > 1 else rig[0]
 
     def __iter__(self) -> Iterator[ImageMessage]:
         """Stream the images; each carries the CameraInfo last recorded for its frame (the first one, before any)."""
@@ -114,7 +145,10 @@ class Bag:
         yield from self._stream({topic for topic, target in self.motion_topics.items() if target != TF_STATIC})
 
     def _stream(self, motion: set[str]) -> Iterator[ImageMessage | MotionMessage]:
-        check = FrameCheck(self.image_type, self.camera_info_topic, self._first_calibration)
+        if self.rig:
+            yield from self._stream_rig(motion)
+            return
+        check = self._frame_check()
         video = VideoStream(self._recorded_type, self._codec, check) if self._codec else None
         for topic, message in tagged_messages(self._files, {self.image_topic, self.camera_info_topic, *motion}):
             if topic in motion:
@@ -128,6 +162,30 @@ class Bag:
                 yield check.image(message.data, message.log_time)
         if video:
             yield from video.finish()
+
+    def _stream_rig(self, motion: set[str]) -> Iterator[ImageMessage | MotionMessage]:
+        """As `_stream`, with the images of all cameras under stamps of their own: theirs may be equal."""
+        checks = [bag._frame_check() for bag in self.rig]
+        images = {bag.image_topic: number for number, bag in enumerate(self.rig)}
+        infos = {bag.camera_info_topic: number for number, bag in enumerate(self.rig)}
+        for topic, message in tagged_messages(self._files, {*images, *infos, *motion}):
+            if topic in motion:
+                yield MotionMessage(self.motion_topics[topic], self._motion_types[topic], message.data)
+            elif topic in infos:
+                check = checks[infos[topic]]
+                check.calibrate(message.data)
+                self._left_out[topic] = check.damaged
+            else:
+                number = images[topic]
+                image = checks[number].image(message.data, message.log_time)
+                frame_id = self.rig[number].frame_id
+                stamp = unique_stamp(image.stamp, number)
+                fault = image.fault or ("" if image.frame_id == frame_id else "calibration: its frame_id has changed")
+                data = image.data if fault else cdr.with_stamp(image.data, stamp)
+                yield replace(image, stamp=stamp, data=data, fault=fault)
+
+    def _frame_check(self) -> FrameCheck:
+        return FrameCheck(self.image_type, self.camera_info_topic, self._first_calibration)
 
     @property
     def readout(self) -> float | None:

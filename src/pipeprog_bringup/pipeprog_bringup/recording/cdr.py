@@ -182,6 +182,12 @@ def header(stamp: int, frame_id: str) -> dict[str, Any]:
     return {"stamp": {"sec": stamp // NANOSECONDS, "nanosec": stamp % NANOSECONDS}, "frame_id": frame_id}
 
 
+def with_stamp(data: bytes, stamp: int) -> bytes:
+    """A message that begins with a header, under another stamp [ns]."""
+    order = "<" if data[1] & 1 else ">"  # the first four bytes are those of the encapsulation
+    return data[:4] + struct.pack(f"{order}iI", *divmod(stamp, NANOSECONDS)) + data[12:]
+
+
 def write_compressed_image(stamp: int, frame_id: str, image_format: str, encoded: bytes) -> bytes:
     """CDR bytes of a CompressedImage."""
     return write(COMPRESSED_IMAGE, {"header": header(stamp, frame_id), "format": image_format, "data": encoded})

@@ -36,12 +36,7 @@ def choose_camera(
         if topic is not None and topic not in known:
             raise InputError(f"{path}: {flag} {topic} is not among its topics: {_listed(known) or 'none of that type'}")
     if image_topic is None:
-        few = len(images) <= MAX_CAMERAS  # each is looked into; of more the error names some in any case
-        cameras = [topic for topic in images if not (few and _is_depth(files, topic, types[topic]))]
-        # The same picture is often recorded several times; frames passes keyframes on compressed in any case.
-        rank = {topic: IMAGE_TYPES.index(types[topic]) for topic in cameras}
-        best = {_base(topic): min(rank[same] for same in cameras if _base(same) == _base(topic)) for topic in cameras}
-        cameras = [topic for topic in cameras if rank[topic] == best[_base(topic)]]
+        cameras = _cameras(files, types, images)
         if info_topic is not None:
             cameras = [topic for topic in cameras if info_topic in _own_infos(files, topic, types, infos)] or cameras
     else:
@@ -67,7 +62,37 @@ def choose_camera(
         for info in _own_infos(files, camera, types, infos)
     ]
     more = [f"  and {len(choices) - _LISTED} more"] if len(choices) > _LISTED else []
-    raise InputError(f"{path} holds several cameras: choose one with\n" + "\n".join(choices[:_LISTED] + more))
+    raise InputError(
+        f"{path} holds several cameras: take all of a robot's with --rig, or choose one with\n"
+        + "\n".join(choices[:_LISTED] + more)
+    )
+
+
+def rig_topics(
+    path: Path, files: tuple[MessageFile, ...], counts: Counter[str], types: dict[str, str]
+) -> list[tuple[str, str]]:
+    """Image and CameraInfo topic of each camera; raises InputError where a camera has no calibration of its own."""
+    infos = sorted(topic for topic, name in types.items() if name == cdr.CAMERA_INFO)
+    cameras = _cameras(files, types, sorted(topic for topic, name in types.items() if name in IMAGE_TYPES))
+    if not 1 < len(cameras) <= MAX_CAMERAS:
+        return [choose_camera(path, files, counts, types, None, None)]
+    pairs = []
+    for camera in cameras:
+        own = _own_infos(files, camera, types, infos)
+        if len(own) != 1:
+            raise InputError(f"{path}: which CameraInfo is that of {camera}? Candidates: {_listed(own) or 'none'}")
+        pairs.append((camera, own[0]))
+    return pairs
+
+
+def _cameras(files: tuple[MessageFile, ...], types: dict[str, str], images: list[str]) -> list[str]:
+    """Image topics, one of each camera: no depth, and of one picture in several encodings the best."""
+    few = len(images) <= MAX_CAMERAS  # each is looked into; of more the error names some in any case
+    cameras = [topic for topic in images if not (few and _is_depth(files, topic, types[topic]))]
+    # The same picture is often recorded several times; frames passes keyframes on compressed in any case.
+    rank = {topic: IMAGE_TYPES.index(types[topic]) for topic in cameras}
+    best = {_base(topic): min(rank[same] for same in cameras if _base(same) == _base(topic)) for topic in cameras}
+    return [topic for topic in cameras if rank[topic] == best[_base(topic)]]
 
 
 def choose_motion(
@@ -113,8 +138,8 @@ def _own_infos(files: tuple[MessageFile, ...], image_topic: str, types: dict[str
     named = [topic for topic in beside if topic in infos]
     if len(infos) == 1 or len(named) == 1:
         return named or infos
-    frame = _frame(files, image_topic, types[image_topic])
-    same = [topic for topic in (named or infos) if frame and _frame(files, topic, cdr.CAMERA_INFO) == frame]
+    frame = image_frame(files, image_topic, types[image_topic])
+    same = [topic for topic in (named or infos) if frame and image_frame(files, topic, cdr.CAMERA_INFO) == frame]
     return same if len(same) == 1 else named[:1] or infos
 
 
@@ -124,7 +149,7 @@ def _base(image_topic: str) -> str:
     return base if transport in _TRANSPORTS else image_topic
 
 
-def _frame(files: tuple[MessageFile, ...], topic: str, type_name: str) -> str:
+def image_frame(files: tuple[MessageFile, ...], topic: str, type_name: str) -> str:
     """The frame of the topic's first message; empty where it cannot be read."""
     first = next(messages_of(files, {topic}), None)
     if first is None:

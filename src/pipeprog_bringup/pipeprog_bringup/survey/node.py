@@ -39,6 +39,7 @@ class SurveyNode(LifecycleNode):
         self._board = declare_fixed(self, "board", "", "file of the boards, where a goal names none")
         self._results = Path(declare_fixed(self, "results", "surveys", "folder that each survey gets a folder in"))
         self._record = declare_fixed(self, "record", False, "keep the images of each survey as recording.mcap")
+        self._cameras = declare_fixed(self, "cameras", "", "of a rig, as of frames: whose images are kept").split()
         self._running: ServerGoalHandle | None = None
         self._is_active = self._end_asked = False
         self._waiting: list[Future] = []
@@ -123,7 +124,7 @@ class SurveyNode(LifecycleNode):
         # A node of this survey alone: with it goes all that was subscribed.
         listener = Node("survey_listener", namespace=self.get_namespace(), use_global_arguments=False)
         self.executor.add_node(listener)
-        robot = RobotInput(self, output) if self._record else None
+        robot = RobotInput(self, output, self._cameras) if self._record else None
         try:
             return await ConductedSurvey(listener, handle, goal, output, self._tick, lambda: self._end_asked).run()
         finally:

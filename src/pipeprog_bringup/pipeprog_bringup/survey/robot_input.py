@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 from nav_msgs.msg import Odometry
@@ -13,10 +14,9 @@ from tf2_msgs.msg import TFMessage
 from pipeprog_bringup.survey.survey_output import SurveyOutput
 from pipeprog_node import qos
 
-_STREAMS = {
-    "image/compressed": CompressedImage,
-    "image": Image,
-    "camera_info": CameraInfo,
+_CAMERA = {"image/compressed": CompressedImage, "image": Image, "camera_info": CameraInfo}
+_RIG = {"compressed": CompressedImage} | _CAMERA  # as frames has them
+_MOTION = {
     "odometry": Odometry,
     "imu": Imu,
     "/tf": TFMessage,
@@ -27,12 +27,15 @@ _DEPTH = 1000  # messages of each topic that may wait while a file is written: 1
 class RobotInput:
     """Subscribes to the topics of the graph's input, by the names under which the node has them."""
 
-    def __init__(self, node: Node, output: SurveyOutput) -> None:
+    def __init__(self, node: Node, output: SurveyOutput, cameras: Sequence[str] = ()) -> None:
+        """`cameras`: what the topics of a rig's cameras begin with; none: one camera."""
         self._node = node
-        profiles = {topic: qos.sensor(_DEPTH) for topic in _STREAMS} | {"/tf_static": qos.kept(_DEPTH)}
+        rig = {f"{camera}/{topic}": kind for camera in cameras for topic, kind in _RIG.items()}
+        streams = (rig or _CAMERA) | _MOTION
+        profiles = {topic: qos.sensor(_DEPTH) for topic in streams} | {"/tf_static": qos.kept(_DEPTH)}
         self._subscriptions = [
             node.create_subscription(kind, topic, partial(self._keep, output, topic, kind), profiles[topic], raw=True)
-            for topic, kind in (_STREAMS | {"/tf_static": TFMessage}).items()
+            for topic, kind in (streams | {"/tf_static": TFMessage}).items()
         ]
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from pipeprog_frames.frame_decision import Load
 
-MAX_QUEUE = 30  # frames that wait: one second of a fast camera, and three times what a replay has on its way
+MAX_QUEUE = 30  # frames of a camera that wait: one second of a fast one, thrice what a replay has on its way
 MAX_QUEUE_BYTES = 1 << 28  # live; as many as the largest image has, 30 raw images of a 4 MP camera
 
 
@@ -25,6 +25,7 @@ class Arrival:
         encode: its JPEG or PNG bytes.
         load: decodes it, reduced and grey.
         refusal: why it cannot be used; empty: it can.
+        camera: which of a rig's it is, by name; empty: there is one camera.
     """
 
     stamp: int
@@ -34,13 +35,14 @@ class Arrival:
     encode: Callable[[], bytes] = bytes
     load: Load = lambda: None
     refusal: str = ""
+    camera: str = ""
 
 
 class ArrivalQueue:
     """Images that wait, in bounded memory; the oldest give way. A `lossless` one is bounded by their number alone."""
 
-    def __init__(self, lossless: bool) -> None:
-        self._lossless = lossless
+    def __init__(self, lossless: bool, most: int = MAX_QUEUE) -> None:
+        self._lossless, self._most = lossless, most
         self._waiting: deque[Arrival] = deque()
         self._nbytes = 0
 
@@ -57,7 +59,7 @@ class ArrivalQueue:
         self._waiting.append(arrival)
         self._nbytes += arrival.nbytes
         dropped = []
-        while len(self._waiting) > MAX_QUEUE or self._is_too_large():
+        while len(self._waiting) > self._most or self._is_too_large():
             dropped.append(self.pop())
         return dropped
 

@@ -13,7 +13,7 @@ from pipeprog_sfm.features.matching import MatchArray, match_guided
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 GUIDED_RADIUS = 4.0  # px around the epipolar segment, as POSE_ERROR: poses are known to a pixel or two
-TEMPORAL = 3  # neighbours in time that every keyframe is matched with: at 80 % overlap they see nearly the same
+TEMPORAL = 3  # nearest in time of its camera, always matched with: at 80 % overlap they see nearly the same
 COVISIBLE = 5  # further views, those of the largest predicted overlap: a constant cost per keyframe
 MIN_OVERLAP = 0.3  # share of the sampled points that such a view must see: fewer give few new matches for the cost
 MAX_ANGLE = np.radians(40)  # between optical axes: SIFT matches a patch seen from up to some 40 degrees aside
@@ -50,8 +50,10 @@ def partners(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -
     keyframes: at least those of the model's views, by stamp.
     """
     gap = np.abs(np.array(model.stamps) - model.stamps[view])
-    gap[view] = np.iinfo(np.int64).max
-    temporal = [int(other) for other in np.argsort(gap, kind="stable")[:TEMPORAL] if other != view]
+    frames = [keyframes[stamp].frame for stamp in model.stamps]
+    never = np.iinfo(np.int64).max
+    gap[[other == view or frame != frames[view] for other, frame in enumerate(frames)]] = never
+    temporal = [int(other) for other in np.argsort(gap, kind="stable")[:TEMPORAL] if gap[other] < never]
     score = _overlaps(model, view, keyframes)
     score[[view, *temporal]] = 0.0
     return temporal + _best(score)

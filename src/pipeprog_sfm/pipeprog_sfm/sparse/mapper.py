@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
@@ -27,7 +28,8 @@ from pipeprog_sfm.sparse.two_view import model_from_pair
 
 GROWTH = 1.3  # in views, between two global adjustments: their cost stays a constant share of the whole
 RETRIES = 3  # waiting keyframes tried again with each new one: a constant cost, and the nearest in time fit best
-START_CANDIDATES = 8  # waiting keyframes that a new one may start a model with: a baseline grows within a second or two
+# Waiting keyframes of each camera that a new one may start a model with: a baseline grows within a second or two.
+START_CANDIDATES = 8
 REMEMBERED = 100  # retired keyframes whose features are kept in case they are added again: 60 MB
 
 
@@ -99,7 +101,7 @@ class Mapper:
         inliers = []
         for keyframe in (known, other):
             self._retrieval.forget(stamp)
-            inliers.append(len(self._localizer.locate_by(model, keyframe, _neighbours(model, stamp)).pairs))
+            inliers.append(len(self._localizer.locate_by(model, keyframe, self._neighbours(model, keyframe)).pairs))
         if inliers[1] <= inliers[0]:
             self._retrieval.forget(stamp)
             return False
@@ -111,7 +113,7 @@ class Mapper:
             matches.pop(stamp, None)
         for keyframe in (other, known):
             self.map.keyframes[stamp] = keyframe
-            if self._register(model, keyframe, _neighbours(model, stamp), None).registered:
+            if self._register(model, keyframe, self._neighbours(model, keyframe), None).registered:
                 return keyframe is other
             self._retrieval.forget(stamp)
         self.map.waiting.append(stamp)
@@ -161,7 +163,7 @@ class Mapper:
         """By the neighbours in time; failing that, by views that look alike."""
         report = KeyframeReport(keyframe.stamp, False, "no model has been started yet", 0, 0.0)
         for model in sorted(self.map.models, key=lambda model: _gap(model, keyframe.stamp))[:2]:
-            report = self._register(model, keyframe, _neighbours(model, keyframe.stamp), COARSE)
+            report = self._register(model, keyframe, self._neighbours(model, keyframe), COARSE)
             if report.registered:
                 return report
         for model in sorted(self.map.models, key=len, reverse=True)[:2]:
@@ -192,10 +194,23 @@ class Mapper:
             self.map.adjust_globally(model)
         return KeyframeReport(stamp, True, "", len(location.pairs), 0.0)
 
+    def _neighbours(self, model: SparseModel, keyframe: Keyframe) -> IntArray:
+        """The two views of its camera nearest in time, and the nearest one of each other camera of a rig."""
+        gap = np.abs(np.array(model.stamps) - keyframe.stamp)
+        count: Counter[str] = Counter()
+        near = []
+        for view in np.argsort(gap, kind="stable"):
+            frame = self.map.keyframes[model.stamps[view]].frame
+            if gap[view] and count[frame] < (2 if frame == keyframe.frame else 1):
+                count[frame] += 1
+                near.append(view)
+        return np.array(near, np.int64)
+
     def _start_model(self, keyframe: Keyframe) -> bool:
         """Starts a model from the new keyframe and the waiting one with which most points can be triangulated."""
         best: SparseModel | None = None
-        for stamp in self.map.waiting[-START_CANDIDATES - 1 : -1]:
+        cameras = len({self.map.keyframes[stamp].frame for stamp in self.map.waiting})
+        for stamp in self.map.waiting[-START_CANDIDATES * cameras - 1 : -1]:
             waiting = self.map.keyframes[stamp]
             matches = self._retrieval.matches(waiting, keyframe, COARSE)
             model = model_from_pair(waiting, keyframe, matches, self._seed)
@@ -236,9 +251,3 @@ def _observations(model: SparseModel) -> int:
 def _gap(model: SparseModel, stamp: int) -> int:
     """Time to the model's nearest view, ns."""
     return min(abs(other - stamp) for other in model.stamps)
-
-
-def _neighbours(model: SparseModel, stamp: int) -> IntArray:
-    """The two views nearest in time, without the keyframe itself."""
-    gap = np.abs(np.array(model.stamps) - stamp)
-    return np.array([view for view in np.argsort(gap, kind="stable")[:3] if gap[view]][:2], np.int64)

@@ -42,19 +42,26 @@ class OverlapTracker:
     def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel) -> list[OverlapReport]:
         """Overlap of the keyframes, by stamp, for which it changed since the last call."""
         view_of = {stamp: view for view, stamp in enumerate(model.stamps)}
-        stamps = sorted(keyframes)
         tied = {stamp: model.features(view) for stamp, view in view_of.items()}
         digests = model.digests().tolist()
-        marks = {stamp: digests[view_of[stamp]] if stamp in view_of else 0 for stamp in stamps}
+        marks = {stamp: digests[view_of[stamp]] if stamp in view_of else 0 for stamp in keyframes}
         changed = []
-        padded = [NO_STAMP, *stamps, NO_STAMP]
-        for before, stamp, after in zip(padded[:-2], stamps, padded[2:], strict=True):
+        for before, stamp, after in _in_time(keyframes):
             mark = (marks.get(before), marks[stamp], marks.get(after))
             if self._reported.get(stamp) != mark:
                 self._reported[stamp] = mark
                 near = (model.point_of[tied[one]] if one in tied else None for one in (before, stamp, after))
                 changed.append(_report(keyframes[stamp], *near))
         return changed
+
+
+def _in_time(keyframes: Mapping[int, Keyframe]) -> list[tuple[int, int, int]]:
+    """Stamps in order of time, each between those before and after it of the same camera."""
+    found: list[tuple[int, int, int]] = []
+    for frame in {keyframe.frame for keyframe in keyframes.values()}:
+        stamps = sorted(stamp for stamp, keyframe in keyframes.items() if keyframe.frame == frame)
+        found += zip([NO_STAMP, *stamps[:-1]], stamps, [*stamps[1:], NO_STAMP], strict=True)
+    return sorted(found, key=lambda around: around[1])
 
 
 def _report(keyframe: Keyframe, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> OverlapReport:

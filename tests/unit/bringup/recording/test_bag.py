@@ -194,6 +194,28 @@ def test_each_camera_of_spot_has_its_own_calibration(tmp_path: Path) -> None:
     assert "frontleft/compressed --camera-info-topic /spot/camera/right/camera_info" not in str(caught.value)
 
 
+def test_all_cameras_of_a_rig_come_under_stamps_of_their_own(tmp_path: Path) -> None:
+    cameras = ("frontleft", "frontright", "right")
+    path = write_bag(tmp_path / "spot.mcap", [one for name in cameras for one in spot_messages(name, name)])
+    rig = Bag.open_rig(path)
+    assert [camera.frame_id for camera in rig.rig] == list(cameras)
+    frames = list(rig)
+    assert len(frames) == rig.image_count == 3 * Bag.open(path, image_topic="/spot/camera/right/compressed").image_count
+    assert len({frame.stamp for frame in frames}) == len(frames)
+    for frame in frames:
+        image = cdr.read_image(frame.data, cdr.COMPRESSED_IMAGE)
+        assert (image.stamp, image.frame_id) == (frame.stamp, frame.frame_id)
+        assert cameras[(frame.stamp - START) % 10] == frame.frame_id
+    one = Bag.open_rig(write_bag(tmp_path / "one.mcap", camera_messages(2)))
+    assert not one.rig
+
+
+def test_cameras_of_one_frame_are_no_rig(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "two.mcap", camera_messages(2, "/left") + camera_messages(2, "/right"))
+    with pytest.raises(InputError, match="frame_id of the cameras /left/image/compressed, /right/image/compressed"):
+        Bag.open_rig(path)
+
+
 def test_where_the_names_do_not_tell_the_frame_does(tmp_path: Path) -> None:
     messages = [
         ("/pictures", cdr.COMPRESSED_IMAGE, START, image(0, "left")),

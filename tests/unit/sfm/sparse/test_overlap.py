@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import CAMERA, STEP
@@ -37,6 +39,20 @@ def test_overlap_is_the_share_of_the_hull_and_of_the_cells_that_tie_points_span(
     assert told[0].matches_next == told[STEP].matches_previous == 3
     assert not told[2 * STEP].registered
     assert (told[2 * STEP].overlap, told[STEP].matches_next) == (0.0, 0)
+
+
+def test_the_keyframes_before_and_after_are_those_of_the_same_camera() -> None:
+    left = [replace(keyframe(STEP * number, SQUARE), frame="left") for number in range(2)]
+    right = [replace(keyframe(STEP * number + 1, SQUARE), frame="right") for number in range(2)]
+    model = SparseModel()
+    for one in (*left, *right):
+        model.add_view(one.stamp, one.rays, one.focal, np.eye(4))
+    model.points = np.zeros((8, 3))
+    model.point_of[:] = [0, 1, 2, 3, 0, 1, 2, -1, 4, 5, 6, 7, 4, 5, -1, -1]
+    told = OverlapTracker().changed({one.stamp: one for one in (*left, *right)}, model)
+    assert [tie.stamp for tie in told] == [0, 1, STEP, STEP + 1]
+    assert [tie.matches_next for tie in told] == [3, 2, 0, 0]
+    assert [tie.matches_previous for tie in told] == [0, 0, 3, 2]
 
 
 def test_features_shifted_to_the_middle_row_span_no_more_than_the_image_as_it_is() -> None:
