@@ -45,7 +45,7 @@ GLUE = {
     "pipeprog_sfm": {"camera_transforms"},
     "pipeprog_bringup": {
         *{"replay", "session", "connections", "player", "listener", "survey_writer"},
-        *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output"},
+        *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},
         *{"survey_client", "conduct"},
     },
 }

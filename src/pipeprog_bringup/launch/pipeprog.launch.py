@@ -15,6 +15,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import LifecycleNode, Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+RESPAWN_DELAY = 2.0  # s; a node that cannot start, as its file is wrong, says so thirty times a minute
+
 ARGUMENTS = [
     DeclareLaunchArgument("boq", description="Bill of quantities: YAML file of the planned pipe classes."),
     DeclareLaunchArgument(
@@ -110,6 +112,8 @@ def pipeprog_node(name: str, parameters: dict, remappings: list) -> Node:
             *("--enclave", [LaunchConfiguration("enclaves"), "/", name]),
         ],
         output="screen",
+        respawn=True,  # a node that dies is there for the next survey
+        respawn_delay=RESPAWN_DELAY,
     )
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 PERIOD = 1.0  # [s]
+PROCESS = "process"  # key of the number of the node's process: another one has been started anew
 
 
 class Diagnostics:
@@ -30,7 +32,7 @@ class Diagnostics:
             name=self._name,
             message=message,
             hardware_id=self._node.get_namespace(),
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+            values=[KeyValue(key=key, value=str(value)) for key, value in {**values, PROCESS: os.getpid()}.items()],
         )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()

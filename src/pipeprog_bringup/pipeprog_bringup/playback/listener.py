@@ -17,6 +17,7 @@ from pipeprog_bringup.playback.watchdog import Watchdog
 from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
+from pipeprog_node.diagnostics import PROCESS
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION
 
 _OPTIONAL = {"refined": (CameraInfo, REFINED_CALIBRATION)}
@@ -106,4 +107,5 @@ class Listener:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self._watchdog.heard(status.name.partition(":")[0])
+            process = next((value.value for value in status.values if value.key == PROCESS), "")
+            self._watchdog.heard(status.name.partition(":")[0], process)

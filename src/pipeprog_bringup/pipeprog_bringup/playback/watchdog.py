@@ -18,14 +18,18 @@ class Watchdog:
     def __init__(self) -> None:
         self._moved = time.monotonic()
         self._heard: dict[str, float] = {}
+        self._processes: dict[str, str] = {}
+        self._restarted = ""
 
     def moved(self) -> None:
         """An image was sent or answered, or a new stage begins."""
         self._moved = time.monotonic()
 
-    def heard(self, name: str) -> None:
-        """A node has sent its diagnostics."""
+    def heard(self, name: str, process: str = "") -> None:
+        """A node has sent its diagnostics from this process; empty: it does not say from which."""
         self._heard[name] = time.monotonic()
+        if process and self._processes.setdefault(name, process) != process:
+            self._restarted = name
 
     def check_movement(self, stage: str, counts: str) -> None:
         """Raises NodeFailure, with `counts` in its text, where nothing has moved for STANDSTILL_SECONDS."""
@@ -33,7 +37,12 @@ class Watchdog:
             raise NodeFailure(f"nothing has moved for {STANDSTILL_SECONDS:.0f} s while {stage}: {counts}")
 
     def check_nodes(self) -> None:
-        """Raises NodeFailure where a node that was heard before has been silent for SILENCE_SECONDS."""
+        """Raises NodeFailure where a node that was heard before was started anew, or is silent for SILENCE_SECONDS."""
+        if self._restarted:
+            raise NodeFailure(
+                f"the node {self._restarted} has died and was started anew: what it had of this survey is lost, "
+                "make the survey once more"
+            )
         now = time.monotonic()
         for name, heard in self._heard.items():
             if now - heard > SILENCE_SECONDS:

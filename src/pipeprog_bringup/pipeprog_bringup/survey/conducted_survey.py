@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from pipeprog_bringup.playback.listener import LastMessages
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.survey.goal import Goal
+from pipeprog_bringup.survey.missing_input import PATIENCE
 from pipeprog_bringup.survey.passage import Cancelled, Passage, SurveyFailure
 from pipeprog_bringup.survey.survey_output import SurveyOutput
 from pipeprog_camera.errors import InputError
@@ -43,13 +44,19 @@ class ConductedSurvey:
         output: SurveyOutput,
         tick: Callable[[], Awaitable[None]],
         is_end_asked: Callable[[], bool],
+        lack: Callable[[], str],
     ) -> None:
-        """`node` is this survey's alone; `tick` waits for a moment; `is_end_asked`: filming is to end."""
+        """`node` is this survey's alone; `tick` waits for a moment.
+
+        `is_end_asked`: filming is to end; `lack`: why no images come, empty: not known.
+        """
         self._handle, self._goal, self._output = handle, goal, output
-        self._wait, self._is_end_asked = tick, is_end_asked
+        self._wait, self._is_end_asked, self._lack = tick, is_end_asked, lack
         self._started = self._told = self._looked = time.monotonic()
         self._stopped = False  # a cancel is heard until it is obeyed
         self._is_full = False
+        self._considered, self._decided = 0, math.inf  # images decided on, and when the last of them came
+        self._missing = ""
         self._passage = Passage(node, self._tick, lambda: handle.is_cancel_requested and not self._stopped)
         depth = qos.reliable(DEPTH)
         node.create_subscription(CompressedImage, IMAGES, self._keep_image, depth, raw=True)
@@ -115,8 +122,18 @@ class ConductedSurvey:
             self._handle.publish_feedback(self._feedback(now - self._started))
         if now - self._looked >= ROOM_PERIOD:
             self._looked = now
+            self._look_for_input(now)
             self._is_full = self._is_full or not self._output.has_room
         await self._wait()
+
+    def _look_for_input(self, now: float) -> None:
+        """Says why no images come, once they have not for a while."""
+        passage = self._passage
+        is_filming = passage.stage == Survey.Feedback.FILMING
+        if not is_filming or passage.log.considered > self._considered or self._decided > now:
+            self._considered, self._decided, self._missing = passage.log.considered, now, ""
+        elif now - self._decided > PATIENCE:
+            self._missing = f"no image for {now - self._decided:.0f} s: {self._lack() or 'the camera sends none'}"
 
     def _keep_image(self, data: bytes) -> None:
         if not self._stopped:
@@ -138,7 +155,7 @@ class ConductedSurvey:
             tracking=log.is_tracking,
             last_known=maps.poses.poses[-1] if maps.poses is not None and maps.poses.poses else PoseStamped(),
             metric=status.metric,
-            advice=status.message,
+            advice=self._missing or status.message,
             classes=[] if maps.newest is None else maps.newest.pipes.classes,
             progress=self._progress(),
             elapsed=messages.duration_msg(elapsed),

@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 
 from pipeprog_bringup.survey.conducted_survey import ConductedSurvey
 from pipeprog_bringup.survey.goal import check_goal, read_site
+from pipeprog_bringup.survey.missing_input import missing_input
 from pipeprog_bringup.survey.robot_input import RobotInput
 from pipeprog_bringup.survey.survey_output import SurveyOutput
 from pipeprog_camera.errors import InputError
@@ -126,7 +127,8 @@ class SurveyNode(LifecycleNode):
         self.executor.add_node(listener)
         robot = RobotInput(self, output, self._cameras) if self._record else None
         try:
-            return await ConductedSurvey(listener, handle, goal, output, self._tick, lambda: self._end_asked).run()
+            ended, lack = (lambda: self._end_asked), (lambda: missing_input(self, self._cameras))
+            return await ConductedSurvey(listener, handle, goal, output, self._tick, ended, lack).run()
         finally:
             if robot is not None:
                 robot.close()

@@ -35,6 +35,17 @@ def test_a_node_that_falls_silent_is_named(clock: Clock) -> None:
         watchdog.check_nodes()
 
 
+def test_a_node_that_was_started_anew_is_named(clock: Clock) -> None:
+    watchdog = Watchdog()
+    for name in ("frames", "sfm", "frames"):
+        watchdog.heard(name, f"process of {name}")
+    watchdog.heard("sfm")  # a node that does not say
+    watchdog.check_nodes()
+    watchdog.heard("sfm", "another")
+    with pytest.raises(NodeFailure, match=r"the node sfm has died and was started anew: what it had .* is lost"):
+        watchdog.check_nodes()
+
+
 def test_a_session_that_stands_still_is_told_with_its_counts(clock: Clock) -> None:
     watchdog = Watchdog()
     clock.now += STANDSTILL_SECONDS - 1.0

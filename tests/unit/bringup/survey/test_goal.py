@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeprog_bringup.survey.goal import MAX_TIME, Site, check_goal, read_site
+from pipeprog_bringup.survey.survey_output import SurveyOutput
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.outside_text import for_terminal
 
 BAGS = Path(__file__).parents[4] / "bags"
 BOQ, BOARD = BAGS / "demo.boq.yaml", BAGS / "demo.board.yaml"
@@ -53,6 +57,54 @@ def test_a_time_limit_that_is_none_is_refused(site: Site, limit: float) -> None:
 def test_a_reference_is_refused_until_surveys_can_be_aligned(site: Site) -> None:
     with pytest.raises(InputError, match="reference"):
         check_goal("a", site, "last_week", 0.0, NOW)
+
+
+ABSURD_NAMES = [
+    *("../up", "..", ".", "/etc/cron.d/x", "a/../../b", "~", "~root", "a/b", "\\\\host\\share", "C:\\x", "-rf"),
+    *("--help", "%2e%2e%2f", "..\u2215up", "a\0b", "a\nb", "\x1b[2J", "\u202egnp", "$(reboot)", "`id`", "; rm -rf /"),
+    *("|", "*", "?", " ", "x" * 65, "x" * 100_000, "é", "\U0001f600", ".hidden", "file:///tmp/x", "s3://bucket/x", "'"),
+]
+ABSURD_FILES = [
+    *("/", "..", "/nowhere/x.yaml", "/dev/null", "/dev/zero", "/proc/self/mem", "/proc/self/environ", "/etc/passwd"),
+    *("s3://bucket/boq.yaml", "http://host/x", "ftp://x", "gopher://x", "javascript:alert(1)", "file://", "file:///"),
+    *("a\0b", "x" * 5000, "/" * 3000, "../" * 500 + "etc/passwd", "%00", "$HOME/boq.yaml", "|cat", "\n", "-", "~"),
+]
+ABSURD_TIMES = [-1.0, -1e-9, MAX_TIME + 1e-3, 1e18, -1e18, float("nan"), float("inf"), float("-inf"), 2.0**31]
+ABSURD_REFERENCES = ["last_week", "/surveys/monday", "../..", "s3://x", "\0", "x" * 10_000]
+FIELDS = ("survey_id", "boq", "board", "time_limit", "reference")
+
+
+def absurd_goal(rng: random.Random) -> dict[str, Any]:
+    """A goal of which one field at least cannot be used."""
+    kinds = dict(zip(FIELDS, (ABSURD_NAMES, ABSURD_FILES, ABSURD_FILES, ABSURD_TIMES, ABSURD_REFERENCES), strict=True))
+    goal = {"survey_id": "level2", "boq": str(BOQ), "board": str(BOARD), "time_limit": 60.0, "reference": ""}
+    for field in rng.sample(FIELDS, rng.randint(1, 3)):
+        text = rng.choice(kinds[field])  # type: ignore[arg-type]
+        turned = isinstance(text, str) and field == "survey_id" and rng.random() < 0.3
+        goal[field] = f"../{text}" if turned else text
+    return goal
+
+
+def begin(goal: dict[str, Any], results: Path) -> SurveyOutput:
+    """What the node does with a goal: its files, its fields, its folder."""
+    site = read_site(goal["boq"], goal["board"])
+    checked = check_goal(goal["survey_id"], site, goal["reference"], goal["time_limit"], NOW)
+    return SurveyOutput(results, checked, record=False)
+
+
+def test_a_thousand_absurd_goals_are_refused_by_name_and_write_nothing(tmp_path: Path) -> None:
+    """Nothing may lie outside the results, nor in them."""
+    results = tmp_path / "surveys"
+    rng = random.Random(19)
+    for _ in range(1000):
+        goal = absurd_goal(rng)
+        with pytest.raises(InputError) as refused:
+            begin(goal, results)
+        text = str(refused.value)
+        named = [str(Path(goal[key].removeprefix("file://")))[:12] for key in ("boq", "board")]
+        assert any(word in text for word in (*FIELDS, *map(for_terminal, named), *named)), text
+        assert len(text) < 5000
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
