@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,14 @@ from numpy.typing import NDArray
 from scenes import CAMERA, STEP, blurred, centre, pose, position_errors, ring_pose, ring_view, view
 
 from pipeprog_camera.camera import Camera
-from pipeprog_sfm.config import MapperConfig
+from pipeprog_camera.rig import unique_stamp
+from pipeprog_sfm.config import MapperConfig, OdometryConfig
 from pipeprog_sfm.features.matching import match
 from pipeprog_sfm.features.retrieval import Retrieval
 from pipeprog_sfm.features.sift import Features, root_sift
+from pipeprog_sfm.metric.rig import rig_measurements
+from pipeprog_sfm.metric.scale import Measurement
+from pipeprog_sfm.metric.transform_tree import Transform, TransformTree
 from pipeprog_sfm.sparse.mapper import Mapper
 
 # [m] Of a point at 2 m, 0.3 px are 0.7 mm; 300 points that hold a camera leave 0.04 mm, which trading turn for shift
@@ -47,6 +52,33 @@ def test_every_keyframe_is_registered_where_it_was(straight: tuple[Mapper, dict[
     assert position_errors(poses, truth).max() < POSITION_TOLERANCE
     # A coordinate's noise of 0.3 px makes errors of 0.38 px on average.
     assert 0.25 < mapper.map.reprojection_error() < 0.45
+
+
+def test_two_cameras_of_a_robot_with_calibrations_of_their_own_make_one_map() -> None:
+    """At equal moments, a quarter of a metre apart, the second with half the pixels: the map is true to their mount."""
+    mapper, truth, frames = Mapper(MapperConfig()), {}, {}
+    half = CAMERA.scaled(0.5)
+    mount = pose(0.0, 0.2) @ np.linalg.inv(pose(0.0))
+    mount[:3, 3] = [-0.25, 0.0, 0.0]  # second_from_first
+    for n, x in enumerate(np.arange(0, 1.4, 0.2)):
+        first = pose(x)
+        for number, (name, camera, place) in enumerate((("left", CAMERA, first), ("right", half, mount @ first))):
+            stamp = unique_stamp(n * STEP, number)
+            features = view(place, 2 * n + number)
+            pixels = ((features.keypoints + 0.5) * (camera.width / CAMERA.width) - 0.5).astype(np.float32)
+            truth[stamp], frames[stamp] = place, name
+            mapper.add_features(stamp, replace(features, keypoints=pixels), camera, name)
+    mapper.finish()
+    poses = mapper.map.camera_from_model()
+    assert list(poses) == sorted(truth)
+    assert position_errors(poses, truth).max() < 2 * POSITION_TOLERANCE  # twice the error of a pixel
+    transforms = TransformTree()
+    transforms.add(Transform(0, "left", name, np.linalg.inv(edge), True) for name, edge in (("right", mount),))
+    (measured,) = rig_measurements(frames, transforms, poses, OdometryConfig())
+    assert isinstance(measured, Measurement)
+    true = np.linalg.norm(centre(truth[6 * STEP]) - centre(truth[0]))
+    found = np.exp(measured.log_scale) * np.linalg.norm(centre(poses[6 * STEP]) - centre(poses[0]))
+    assert found == pytest.approx(true, rel=4 * measured.sigma)
 
 
 def test_overlap_is_reported_once_and_again_when_it_changes() -> None:
