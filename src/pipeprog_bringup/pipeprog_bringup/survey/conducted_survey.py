@@ -76,6 +76,8 @@ class ConductedSurvey:
             survey = await passage.work_off()
         except SurveyFailure as failure:
             result.error_code, result.error_msg = failure.code, str(failure)
+            if failure.code == Survey.Result.NO_IMAGES and (lack := self._lack()):
+                result.error_msg = f"no image has come: {lack}"
         except Cancelled:
             result.error_msg = ""
         self._stopped = True
