@@ -57,6 +57,7 @@ def make_board_film(
     frames = (
         (
             FIRST_STAMP + round(time * 1e9),
+            0,
             compress(develop(film.frame(time), sensor, np.random.default_rng([seed, number])), sensor),
         )
         for number, time in shown

@@ -76,10 +76,12 @@ FIELDS = ("survey_id", "boq", "board", "time_limit", "reference")
 
 def absurd_goal(rng: random.Random) -> dict[str, Any]:
     """A goal of which one field at least cannot be used."""
-    kinds = dict(zip(FIELDS, (ABSURD_NAMES, ABSURD_FILES, ABSURD_FILES, ABSURD_TIMES, ABSURD_REFERENCES), strict=True))
+    kinds: dict[str, Any] = dict(
+        zip(FIELDS, (ABSURD_NAMES, ABSURD_FILES, ABSURD_FILES, ABSURD_TIMES, ABSURD_REFERENCES), strict=True)
+    )
     goal = {"survey_id": "level2", "boq": str(BOQ), "board": str(BOARD), "time_limit": 60.0, "reference": ""}
     for field in rng.sample(FIELDS, rng.randint(1, 3)):
-        text = rng.choice(kinds[field])  # type: ignore[arg-type]
+        text: Any = rng.choice(list(kinds[field]))
         turned = isinstance(text, str) and field == "survey_id" and rng.random() < 0.3
         goal[field] = f"../{text}" if turned else text
     return goal
