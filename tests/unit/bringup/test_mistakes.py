@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from pipeprog_bringup.footage.camera_file import read_camera_file
+from pipeprog_bringup.recording.bag_folder import parts
 from pipeprog_bringup.results.scored_files import read_result, read_truth
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_boq
@@ -68,6 +69,17 @@ def test_a_mistake_is_told_with_the_file_and_the_remedy(
         read(file)
     assert "given.yaml" in str(told.value)
     assert expected in str(told.value)
+
+
+def test_a_recording_that_is_not_there_is_told_with_one_that_is(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no recording"):
+        parts(tmp_path / "walk_1.mcap")
+    (tmp_path / "walk1.mcap").touch()
+    (tmp_path / "walk1.yaml").touch()
+    with pytest.raises(InputError, match=r"walk_1\.mcap: did you mean 'walk1\.mcap'\?"):
+        parts(tmp_path / "walk_1.mcap")
+    with pytest.raises(InputError, match="there is no folder"):
+        parts(tmp_path / "gone" / "walk1.mcap")
 
 
 def test_two_systems_of_one_radius_are_one_class_of_two_lines(tmp_path: Path) -> None:

@@ -9,10 +9,11 @@ from typing import Any
 
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_BAG_PARTS, MAX_METADATA
-from pipeprog_camera.outside_text import shown
+from pipeprog_camera.outside_text import nearest, shown
 from pipeprog_camera.yaml_file import read_yaml
 
 _LISTED = 5  # names that an error lists
+_SUFFIXES, _MOST_NAMES = (".mcap", ".db3", ".bag"), 1000  # of recordings beside one that is not there
 _STORAGES = ("mcap", "sqlite3", "")  # an empty one is what a crash leaves (rosbag2#2175)
 _NUMBERED = re.compile(r"(.+)_(\d{1,9})\.(mcap|db3)")  # the names that rosbag2 gives the files of one recording
 
@@ -20,7 +21,7 @@ _NUMBERED = re.compile(r"(.+)_(\d{1,9})\.(mcap|db3)")  # the names that rosbag2 
 def parts(path: Path) -> list[Path]:
     """The files of the recording `path`, in order; raises InputError where it is none or files are missing."""
     if not path.exists():
-        raise InputError(f"no such bag: {path}")
+        raise InputError(f"no such bag: {path}: {_instead_of(path)}")
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return _named_files(path, _information(path))
@@ -28,6 +29,14 @@ def parts(path: Path) -> list[Path]:
     if not path.is_file():
         raise InputError(f"{path} is a device or a pipe: give an .mcap or .db3 file or a rosbag2 folder")
     return [path]
+
+
+def _instead_of(missing: Path) -> str:
+    """What to give in place of a file that is not there."""
+    if not missing.parent.is_dir():
+        return f"there is no folder {missing.parent}, check the path"
+    there = [each.name for each in missing.parent.iterdir() if each.suffix in _SUFFIXES][:_MOST_NAMES]
+    return f"did you mean '{nearest(missing.name, there)}'?" if there else f"{missing.parent} holds no recording"
 
 
 def _information(path: Path) -> dict[str, Any]:
