@@ -63,8 +63,8 @@ MUTANTS = {
     ),
     "boards: chi square of one degree of freedom for three": Mutant(
         "pipeprog_sfm.boards.board_check.contradiction",
-        "FALSE_ALARM, 3)",
-        "FALSE_ALARM, 1)",
+        "chdtri(3, FALSE_ALARM)",
+        "chdtri(1, FALSE_ALARM)",
         "sfm/boards/test_board_check.py",
     ),
     "metric: rotation of the odometry transposed": Mutant(

@@ -128,8 +128,8 @@ def test_spot_remote_mission(robot: FakeRobot, monkeypatch: pytest.MonkeyPatch) 
     robot.failing = ["", "no board was seen"]
     try:
         assert action() == ["SUCCESS"]
-        assert robot.said[0].startswith("survey")
         assert action()[-1] == "SUCCESS"
+        assert robot.said[0].startswith("survey")
         assert robot.said[1] == "end"
         assert action() == ["SUCCESS"]
         assert action()[-1] == "FAILUREno board was seen"
