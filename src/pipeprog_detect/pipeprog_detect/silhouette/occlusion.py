@@ -17,9 +17,9 @@ from pipeprog_detect.cloud.octree import THREADS
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ContourSamples, parts_by_view
 from pipeprog_detect.types import Cylinder, View
 
-# Cells across an image, and points at the most that fill them: 40 in each of the 160 x 90 cells of a view that shows a
-# seventh of the points. A surface at half the distance has a quarter as many in a cell: fewer points leave holes there.
-COLUMNS, MOST_POINTS = 160, 4_000_000
+# Cells across an image, and points at the most that fill them: 12 in each of the 160 x 90 cells of a view that shows a
+# seventh of the points.
+COLUMNS, MOST_POINTS = 160, 1_200_000
 # The second nearest point of a cell counts: a single one may be a stray of the stereo.
 LEAST_POINTS = 2
 # A cell that shows what is farther than all eight around it is a hole of the cloud, not a gap in what hides the rest.
