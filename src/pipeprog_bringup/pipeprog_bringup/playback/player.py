@@ -74,7 +74,6 @@ class Player:
             previous = message.stamp
             self._send_image(message)
             played += 1
-            spin(0.0)
         if not played:
             raise InputError(f"{self._bag.path}: all {self._bag.image_count} images are damaged")
         return played

@@ -128,6 +128,8 @@ class Session:
 
     def _spin(self, seconds: float = _SPIN_SECONDS) -> None:
         """Handle what has arrived, show where the session stands, and make sure that every node works."""
+        # One callback is handled. With another timeout than in the call before, rclpy looks at the first subscription
+        # again, so calls of two timeouts in turn would never come to the others.
         self._executor.spin_once(timeout_sec=min(max(seconds, 0.0), _SPIN_SECONDS))
         self._repeat_signals()
         self._graph.check()

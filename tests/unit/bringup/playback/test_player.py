@@ -10,6 +10,7 @@ import pytest
 from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.playback.player import MAX_GAP, Player
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_camera.errors import InputError
 from tests.fuzz.bag_reading import Doors, read
 from tests.fuzz.hostile_bags import cases
@@ -72,3 +73,32 @@ def test_a_rate_is_not_held_over_years(tmp_path: Path) -> None:
     dues: list[float] = []
     Player(Doors(log), bag, log).play(1.0, lambda seconds: None, dues.append)
     assert [round(later - due, 6) for due, later in pairwise(dues)] == [MAX_GAP] * 7
+
+
+class Slow(FrameLog):
+    """Decisions wait in `late` until they are asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.late: list[FrameRow] = []
+
+    def decide(self, row: FrameRow) -> None:
+        self.late.append(row)
+
+    def decide_one(self) -> None:
+        super().decide(self.late.pop(0))
+
+
+def test_waits_have_one_timeout_so_that_no_topic_starves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With timeouts that alternate, an executor of rclpy serves its first topic alone."""
+    monkeypatch.setattr("pipeprog_bringup.playback.player.IN_FLIGHT", 2)
+    log, waits = Slow(), []
+
+    def spin(seconds: float) -> None:
+        waits.append(seconds)
+        log.decide_one()
+
+    bag = Bag.open(written(tmp_path, "times: stamps far apart"))
+    Player(Doors(log), bag, log).play(None, spin, lambda due: None)
+    assert len(waits) == 6
+    assert len(set(waits)) == 1
