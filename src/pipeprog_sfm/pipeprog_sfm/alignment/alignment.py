@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.alignment.placing import NotAlignedError, Placing, place_by_boards, place_by_places
-from pipeprog_sfm.alignment.plane_check import MIN_CHECKED, PlaneCheck, check_planes
+from pipeprog_sfm.alignment.plane_check import PlaneCheck, agree_across, check_planes
 from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.features.keyframe import Keyframe
@@ -18,7 +18,7 @@ from pipeprog_sfm.sparse.guided_matching import link_among
 from pipeprog_sfm.sparse.model_adjustment import adjust_points, adjust_views
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
-LEAST_SHARED = 100  # points that both see, where boards alone place the survey: by chance a few match
+LEAST_SHARED = 0.1  # of its points that both see, where a board places the survey: by chance one in fifty matches
 TURNS = 2  # of matching and adjusting: the second finds what the first, a few px off, has not
 
 
@@ -70,14 +70,30 @@ def align(
     Raises:
         NotAlignedError: the reference was not found again, or its surfaces contradict; the model is as it was then.
     """
-    placing = place_by_boards(model, boards, reference) or place_by_places(model, keyframes, reference, seed)
+    placing = place_by_boards(model, boards, reference)
+    if placing is None:
+        return _placed(model, keyframes, place_by_places(model, keyframes, reference, seed), reference)
+    try:
+        return _placed(model, keyframes, placing, reference)
+    except NotAlignedError as by_boards:
+        try:
+            return _placed(model, keyframes, place_by_places(model, keyframes, reference, seed), reference)
+        except NotAlignedError as by_places:
+            raise NotAlignedError(f"{by_boards}; and {by_places}") from None
+
+
+def _placed(model: SparseModel, keyframes: Mapping[int, Keyframe], placing: Placing, reference: SurveyMap) -> Alignment:
+    """Adjusts the model to the reference from this placing on; raises NotAlignedError where it is doubtful."""
     joint, shared = _adjusted(model, keyframes, placing, reference)
     own = np.array([joint.stamps.index(stamp) for stamp in _new_stamps(model, reference)])
     points = joint.points[np.unique(np.concatenate([joint.seen(view) for view in own]))]
     planes = check_planes(points, reference.cloud, reference.normals)
     doubt = planes.contradiction
-    if placing.by == "boards" and shared < LEAST_SHARED and planes.points < MIN_CHECKED:
-        doubt = "neither places nor surfaces of the reference are where the boards say: they may hang elsewhere"
+    # Two boards that hang to each other as they hung are proof enough; a single one hangs on a wall in any room.
+    if len(placing.board_normals) == 1 and shared < LEAST_SHARED * len(points) and not doubt:
+        (normal,) = placing.board_normals
+        if not agree_across(points, reference.cloud, reference.normals, normal):
+            doubt = "neither places nor surfaces beside its wall are where the board says: it may hang elsewhere"
     if doubt:
         raise NotAlignedError(f"it would lie in the frame of the reference by {placing.by}, but {doubt}")
     _take_over(model, joint, own, placing.reference_from_model)

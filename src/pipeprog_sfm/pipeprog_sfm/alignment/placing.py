@@ -8,7 +8,7 @@ agree, solved anew from the features of all (a generalised absolute pose whose s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -54,12 +54,14 @@ class Placing:
         covariance: (7, 7) of shift [m], turn [rad] about the middle of what was seen, and logarithm of the scale.
         keyframes: number of those that agree.
         by: `boards` or `places`.
+        board_normals: (B, 3) of the boards in the reference; empty by places.
     """
 
     reference_from_model: FloatArray
     covariance: FloatArray
     keyframes: int
     by: str
+    board_normals: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
 
 
 def place_by_boards(model: SparseModel, model_boards: Sequence[PlacedBoard], reference: SurveyMap) -> Placing | None:
@@ -88,7 +90,9 @@ def place_by_boards(model: SparseModel, model_boards: Sequence[PlacedBoard], ref
     arms = target - target.mean(0)
     size = float(np.sqrt((arms**2).sum()))
     sigmas = [least / np.sqrt(len(target))] * 3 + [least / size] * 4
-    return Placing(best, np.diag(np.square(np.maximum(sigmas, 1e-6))), 0, "boards")
+    # A board's circles lie in a plane: its normal is the direction in which they scatter least.
+    board_normals = np.array([np.linalg.svd(known[name] - known[name].mean(0))[2][2] for name in common])
+    return Placing(best, np.diag(np.square(np.maximum(sigmas, 1e-6))), 0, "boards", board_normals)
 
 
 def place_by_places(model: SparseModel, keyframes: Mapping[int, Keyframe], reference: SurveyMap, seed: int) -> Placing:

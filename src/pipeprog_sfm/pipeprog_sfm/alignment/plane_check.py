@@ -20,6 +20,8 @@ REACH = 0.2  # m within which a surface of the reference is taken for the one th
 ON_PLANE = 0.015  # m; a sparse point has 3 to 5 mm of noise two metres away, a surface 15 mm beside it is another one
 MIN_SHARE = 0.5  # of the points near a surface that lie on it; of points spread evenly within REACH, 8 % do
 MIN_CHECKED = 500  # points near surfaces, fewer say nothing
+MIN_ACROSS = 200  # points on surfaces that stand across a board, in each direction: a share of them is known to 4 %
+ACROSS = 0.5  # cosine between a surface's normal and the board's, at most
 MAX_SHIFT = 0.01  # m by which the clouds may still want to be moved: half a cell of the thin cloud
 
 
@@ -45,16 +47,10 @@ class PlaneCheck:
 
 def check_planes(points: FloatArray, cloud: NDArray[np.float32], normals: NDArray[np.float32]) -> PlaneCheck:
     """Compares (N, 3) points of a survey with the reference's (M, 3) cloud and normals, all in one frame."""
-    points = points[:: max(len(points) // MAX_POINTS, 1)].astype(float)
-    if not len(cloud) or not len(points):
-        return PlaneCheck(0, 0.0, 0.0)
-    distance, nearest = cKDTree(cloud).query(points, distance_upper_bound=REACH)
-    near = np.isfinite(distance)
-    count = int(near.sum())
+    own, normal, off = _offsets(points, cloud, normals)
+    count = len(own)
     if not count:
         return PlaneCheck(0, 0.0, 0.0)
-    own, normal = points[near], normals[nearest[near]].astype(float)
-    off = np.einsum("ij,ij->i", own - cloud[nearest[near]], normal)
     on = np.abs(off) < ON_PLANE
     middle = own.mean(0)
     rows = np.concatenate([normal, np.cross(own - middle, normal)], axis=1)
@@ -65,3 +61,33 @@ def check_planes(points: FloatArray, cloud: NDArray[np.float32], normals: NDArra
     held = matrix + np.eye(6) * 1e-3 * np.trace(matrix) / 6
     step = np.linalg.solve(held, -gradient) if weight.any() else np.zeros(6)
     return PlaneCheck(count, float(on.mean()), float(np.linalg.norm(step[:3])))
+
+
+def agree_across(
+    points: FloatArray, cloud: NDArray[np.float32], normals: NDArray[np.float32], board_normal: FloatArray
+) -> bool:
+    """Whether surfaces that stand across a board agree in both directions of its plane; arguments as `check_planes`.
+
+    The wall that a board hangs on agrees in any room with that board: the floor and a side wall tell where on it.
+    """
+    _, normal, off = _offsets(points, cloud, normals)
+    across = np.abs(normal @ board_normal) < ACROSS
+    if not across.any() or (np.abs(off[across]) < ON_PLANE).mean() < MIN_SHARE:
+        return False
+    held = normal[across & (np.abs(off) < ON_PLANE)]
+    in_plane = held - np.outer(held @ board_normal, board_normal)
+    # The least of the three is that along the board's normal, which is zero.
+    return bool(np.linalg.eigvalsh(in_plane.T @ in_plane)[1] > MIN_ACROSS)
+
+
+def _offsets(
+    points: FloatArray, cloud: NDArray[np.float32], normals: NDArray[np.float32]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points near the reference's surfaces, the normals of these (K, 3) each, and how far from them they are (K,)."""
+    points = points[:: max(len(points) // MAX_POINTS, 1)].astype(float)
+    if not len(cloud) or not len(points):
+        return np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
+    distance, nearest = cKDTree(cloud).query(points, distance_upper_bound=REACH)
+    near = np.isfinite(distance)
+    own, normal = points[near], normals[nearest[near]].astype(float)
+    return own, normal, np.einsum("ij,ij->i", own - cloud[nearest[near]], normal)

@@ -14,7 +14,8 @@ from scenes import CAMERA
 
 from pipeprog_sfm.alignment.alignment import align
 from pipeprog_sfm.alignment.placing import NotAlignedError
-from pipeprog_sfm.alignment.survey_map import MappedBoard
+from pipeprog_sfm.alignment.plane_check import agree_across
+from pipeprog_sfm.alignment.survey_map import MappedBoard, SurveyMap
 from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.features.keyframe import Keyframe
@@ -72,27 +73,69 @@ def test_surfaces_that_lie_elsewhere_contradict() -> None:
         align(night.model, night.keyframes, (), moved)
 
 
-@pytest.mark.parametrize("hung_on", ["its place", "another wall"])
-def test_boards_align_where_nothing_else_looks_alike(hung_on: str) -> None:
-    """By boards where both have them; a board that hangs elsewhere is found out by the walls."""
-    night = second(painted_anew=True)
+def with_board(night: Night, shift: tuple[float, float, float], turned: bool = False) -> tuple[SurveyMap, PlacedBoard]:
+    """The reference with a board on its wall, shifted [m] and turned there, and the board in the night's model."""
     circles = np.array([[-0.24, 0.15], [0.24, 0.15], [0.0, 0.0], [-0.24, -0.15], [0.24, -0.15]])
     board = Board("A", 0.04, np.c_[circles, np.zeros(5)])
     world_from_board = np.diag([1.0, -1.0, -1.0, 1.0])
     world_from_board[:3, 3] = 1.0, 0.0, 2.0
-    map_from_board = MAP_FROM_WORLD @ world_from_board
-    placed = PlacedBoard(board, (), np.linalg.inv(night.true_similarity) @ map_from_board, 1e-4, 0.1, 0.1)
-    hung = circles_of(board, map_from_board)
-    if hung_on == "another wall":
+    placed = PlacedBoard(
+        board, (), np.linalg.inv(night.true_similarity) @ MAP_FROM_WORLD @ world_from_board, 1e-4, 0.1, 0.1
+    )
+    world_from_board[:3, 3] += shift
+    hung = circles_of(board, MAP_FROM_WORLD @ world_from_board)
+    if turned:
         hung = hung @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    earlier = replace(reference(), boards=(MappedBoard("A", hung),))
-    if hung_on == "another wall":
-        with pytest.raises(NotAlignedError, match="by boards"):
-            align(night.model, night.keyframes, [placed], earlier)
-    else:
-        found = align(night.model, night.keyframes, [placed], earlier)
-        assert found.by == "boards"
-        assert errors(night, found.reference_from_model)[0] < PLACE
+    return replace(reference(), boards=(MappedBoard("A", hung),)), placed
+
+
+@pytest.mark.parametrize("painted_anew", [False, True], ids=["places agree", "surfaces agree"])
+def test_a_board_that_hangs_in_its_place_aligns(painted_anew: bool) -> None:
+    night = second(painted_anew)
+    earlier, placed = with_board(night, (0.0, 0.0, 0.0))
+    found = align(night.model, night.keyframes, [placed], earlier)
+    assert found.by == "boards"
+    assert errors(night, found.reference_from_model)[0] < PLACE
+
+
+@pytest.mark.parametrize(
+    ("shift", "turned"),
+    [((0.0, 0.0, 0.0), True), ((0.7, 0.0, 0.0), False), ((0.3, -0.2, 0.0), False)],
+    ids=["on another wall", "along its wall", "elsewhere on its wall"],
+)
+def test_a_board_alone_aligns_no_other_room(shift: tuple[float, float, float], turned: bool) -> None:
+    """Nothing looks alike, and the wall that the board hangs on agrees in any room."""
+    night = second(painted_anew=True)
+    earlier, placed = with_board(night, shift, turned)
+    with pytest.raises(NotAlignedError, match="by boards"):
+        align(night.model, night.keyframes, [placed], earlier)
+
+
+def room(rng: np.random.Generator, count: int = 2000) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a wall (y = 0), a side wall (x = 0) and a floor (z = 0), and their normals."""
+    points = rng.uniform(0.0, [3.0, 3.0, 2.5], (3 * count, 3))
+    normals = np.repeat(np.eye(3)[[1, 0, 2]], count, axis=0)
+    points[normals > 0] = rng.normal(0.0, 0.003, 3 * count)
+    return points, normals
+
+
+@pytest.mark.parametrize(
+    ("shift", "agree"),
+    [((0.0, 0.0, 0.0), True), ((0.0, 0.08, 0.0), True), ((0.05, 0.0, 0.0), False), ((0.0, 0.0, 0.05), False)],
+)
+def test_floor_and_side_wall_tell_where_on_its_wall_a_board_hangs(shift: tuple[float, ...], agree: bool) -> None:
+    rng = np.random.default_rng(5)
+    cloud, normals = (part.astype(np.float32) for part in room(rng))
+    points = room(rng)[0] + shift
+    assert agree_across(points, cloud, normals, np.array([0.0, 1.0, 0.0])) == agree
+
+
+def test_a_floor_alone_does_not_tell_where_on_its_wall_a_board_hangs() -> None:
+    rng = np.random.default_rng(5)
+    cloud, normals = (part.astype(np.float32) for part in room(rng))
+    rows = normals[:, 0] < 0.5
+    points, own = room(rng)
+    assert not agree_across(points[own[:, 0] < 0.5], cloud[rows], normals[rows], np.array([0.0, 1.0, 0.0]))
 
 
 def circles_of(board: Board, map_from_board: np.ndarray) -> np.ndarray:
