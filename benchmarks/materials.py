@@ -70,7 +70,7 @@ def main(
 
 
 def measured(looks: Sequence[Look], count: int) -> dict[str, Any]:
-    """Counts over bills of so many materials a radius, the true one among them."""
+    """Counts over bills with this number of materials a radius, the true one among them."""
     rng = np.random.default_rng(count)
     tally: Counter[str] = Counter()
     for material, features in looks:

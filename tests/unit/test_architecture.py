@@ -30,6 +30,7 @@ ALLOWED_IN_NODES = {"pipeprog_node", "pipeprog_msgs"}
 GLUE = {
     "pipeprog_node": {
         "parameters",
+        "camera_transforms",
         "qos",
         "diagnostics",
         "discovery",
@@ -42,7 +43,6 @@ GLUE = {
         "renewal",
         "worker",
     },
-    "pipeprog_sfm": {"camera_transforms"},
     "pipeprog_bringup": {
         *{"replay", "session", "connections", "player", "listener", "survey_writer"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},

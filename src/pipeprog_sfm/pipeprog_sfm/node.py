@@ -30,6 +30,7 @@ from pipeprog_camera.limits import (
 )
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos, received_keyframes, received_motion
+from pipeprog_node.camera_transforms import FRAME, CameraTransforms
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
@@ -42,7 +43,6 @@ from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.alignment.map_file import read_map
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
-from pipeprog_sfm.camera_transforms import FRAME, CameraTransforms
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, Transform
 from pipeprog_sfm.reconstruction import MetricMap, Status, Trajectory
@@ -356,19 +356,21 @@ class SfmNode(Node):
             self._publish_overlap(event.overlaps, messages.header(event.stamp, event.frame))
             if event.trajectory is not None:
                 self._output.publish_poses(event.trajectory)
-                if self._transforms:
-                    self._transforms.publish(event.trajectory, self._camera_frame)
+                self._publish_transform(event.trajectory)
         elif isinstance(event, Retired):
             self._supervision.answered()
             self._end_retirement(event.overlaps)
         elif isinstance(event, MapReady):
             self._output.publish_map(event.map, self._camera_frame)
-            if self._transforms:
-                self._transforms.publish(event.map.trajectory, self._camera_frame)
+            self._publish_transform(event.map.trajectory)
         self._publish_status()
         if isinstance(event, Finished):
             self._supervision.fulfilled()
             self._finish.answer(self._output.revision, event.problem)
+
+    def _publish_transform(self, trajectory: Trajectory) -> None:
+        if self._transforms:
+            self._transforms.publish(trajectory.stamps, trajectory.map_from_camera, self._camera_frame)
 
     def _on_death(self, exit_code: int) -> None:
         death = self._supervision.restart(exit_code)

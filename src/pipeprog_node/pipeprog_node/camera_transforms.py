@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 
 from pipeprog_node import messages, qos
-from pipeprog_sfm.reconstruction import Trajectory
 
 FRAME = "map"
 DEPTH = 100  # as tf2's own broadcasters
@@ -23,12 +24,12 @@ class CameraTransforms:
         self._publisher = node.create_publisher(TFMessage, "/tf", qos.reliable(DEPTH))
         self._last = -1
 
-    def publish(self, trajectory: Trajectory, camera_frame: str) -> None:
-        """The place of the newest keyframe, once: tf2 keeps the first transform of a stamp."""
-        newest = int(trajectory.stamps.argmax())
-        stamp = int(trajectory.stamps[newest])
+    def publish(self, stamps: NDArray[np.int64], map_from_camera: NDArray[np.float64], camera_frame: str) -> None:
+        """The place of the newest of (M,) stamps [ns], poses (M, 4, 4) [m]; once, as tf2 keeps a stamp's first."""
+        newest = int(stamps.argmax())
+        stamp = int(stamps[newest])
         if stamp <= self._last:
             return
         self._last = stamp
-        moved = messages.transform(stamp, FRAME, camera_frame, trajectory.map_from_camera[newest])
+        moved = messages.transform(stamp, FRAME, camera_frame, map_from_camera[newest])
         self._publisher.publish(TFMessage(transforms=[moved]))
