@@ -35,9 +35,9 @@ def report(
     surveys = read_surveys(folders)
     if pdf:
         browser()
-    content = gather(surveys, show)
-    show(0.8, "page")
     with output_file(target, force) as temporary:
+        content = gather(surveys, show)
+        show(0.8, "page")
         # Halves of surrogate pairs, which JSON can hold, are no text in UTF-8.
         temporary.write_text(page(content), encoding="utf-8", errors="replace")
     if pdf:

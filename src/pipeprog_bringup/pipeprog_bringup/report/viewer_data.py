@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page's 3-D view shows: the cloud in nine bytes a point, pipes and cameras as numbers."""
+"""What the page's 3-D view shows: the cloud in nine bytes a point; pipes, cameras and boards as numbers."""
 
 from __future__ import annotations
 
@@ -8,19 +8,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 
 from pipeprog_bringup.report.render import LIFT
 from pipeprog_bringup.report.survey_reader import Survey
 from pipeprog_bringup.results.plan_file import read_plan
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.types import Cylinder
+from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
 
 MOST_POINTS = 400_000  # 3.6 MB, of the page's 15; the graphics of a phone draw as many without delay
 MOST_CAMERAS = 2000  # pyramids; more are every n-th
 STEPS = 65_535  # of a coordinate in 16 bits: 0.3 mm in a box of 20 m
+CIRCLE_CORNERS = 12  # of a board's circle, which is a few pixels wide
 PALE = 190  # grey of a cloud without colours
 
 
@@ -67,12 +71,13 @@ def cloud_bytes(cloud: Thinned) -> dict[str, Any]:
 
 
 def view(survey: Survey, previous: Survey | None, letters: Sequence[str]) -> dict[str, Any]:
-    """Pipes, cameras, planned pipes that are not installed and the pipes of the survey before, as plain values."""
+    """Pipes, cameras, boards, planned pipes that are not installed and pipes of the survey before, as plain values."""
     poses = survey.results.map_from_camera
     shown = poses[:: -(-len(poses) // MOST_CAMERAS)] if len(poses) else poses
     return {
         "pipes": _pipes(survey, letters),
         "cameras": np.round(shown[:, :3].reshape(-1, 12), 4).tolist(),
+        "boards": _boards(survey),
         "planned": _planned(survey),
         "previous": [] if previous is None else _pipes(previous, [""] * len(previous.pipes)),
     }
@@ -111,6 +116,32 @@ def _planned(survey: Survey) -> list[dict[str, Any]]:
         for pipe in read_plan(path)
         if states.get(pipe.id) not in (None, "installed")
     ]
+
+
+def _boards(survey: Survey) -> list[dict[str, Any]]:
+    """Boards where they hung, each a name and closed lines; none where the survey has left no map."""
+    path = survey.results.folder / MAP_FILE
+    if not path.is_file():
+        return []
+    return [
+        {"name": board.name, "lines": [np.round(line, 4).tolist() for line in board_lines(board.circles)]}
+        for board in read_map(path).boards
+    ]
+
+
+def board_lines(circles: FloatArray) -> list[FloatArray]:
+    """Closed lines (M, 3) in a board's plane: the rectangle around its circles (N, 3), N > 2, and each circle [m].
+
+    The map keeps no radii: the circles are drawn half as wide as the least distance between two.
+    """
+    middle = circles.mean(axis=0)
+    plane = np.linalg.svd(circles - middle, full_matrices=False)[2][:2]
+    corners = cv2.boxPoints(cv2.minAreaRect(((circles - middle) @ plane.T).astype(np.float32)))
+    radius = 0.25 * float(pdist(circles).min())
+    angles = np.linspace(0.0, 2 * np.pi, CIRCLE_CORNERS, endpoint=False)
+    ring = radius * np.column_stack([np.cos(angles), np.sin(angles)]) @ plane
+    outward = 2 * radius * np.sign(corners - corners.mean(axis=0))
+    return [middle + (corners + outward) @ plane, *(circle + ring for circle in circles)]
 
 
 def _one_a_cell(points: FloatArray, chosen: NDArray[np.int64]) -> NDArray[np.int64]:

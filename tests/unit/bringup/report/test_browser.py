@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,11 @@ from pipeprog_detect.product.boq import PlannedPipe
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Pipe
+from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
+from pipeprog_sfm.alignment.survey_map import MappedBoard
 from tests.browser import CHROMIUM, WITHOUT, Browser
 from tests.unit.bringup.report.filmed import LEVEL, UPRIGHT, looking_along_y, run
+from tests.unit.bringup.results.test_lives import mapped
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason=WITHOUT)
 
@@ -40,6 +44,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     classes = [ClassProgress(name, 0.05, 10.0, 6.2, 62.0) for name in names]
     result_files.write_pipes(folder / "pipes.json", Product(pipes, classes, []), result_files.Scale("board", 0.0004))
     plan(folder, names[1])
+    board = MappedBoard("A", np.array([[0.5, 2.1, 0.0], [0.6, 2.1, 0.0], [0.5, 2.1, 0.2], [0.6, 2.1, 0.2]]))
+    write_map(folder / MAP_FILE, replace(mapped("own", ""), boards=(board,)))
     wall = np.random.default_rng(0).uniform([-1, 2.1, -1], [1, 2.11, 1], (5000, 3))
     write_ply(folder / "cloud.ply", wall, np.full((5000, 3), 120, np.uint8))
     return report([folder], tmp_path_factory.mktemp("page") / "report.html", False, lambda share, stage: None)
@@ -174,7 +180,7 @@ def test_keys_choose_and_turn(browser: Browser, page: Path) -> None:
 def test_each_kind_is_one_draw_call(browser: Browser, page: Path) -> None:
     browser.open(page, *DESKTOP)
     drawn = browser.run("reportView.drawn()")
-    assert drawn["calls"] == 4, "cloud, pipes, planned pipes, cameras"
+    assert drawn["calls"] == 5, "cloud, pipes, planned pipes, cameras, boards"
     assert drawn["points"] == 5000
 
 
@@ -191,3 +197,10 @@ def test_planned_pipes_that_are_not_installed_stand_in_the_view(page: Path, brow
     assert "planned, not installed" in browser.run("document.getElementById('layers').textContent")
     planned = browser.run("JSON.parse(document.getElementById('view-data').textContent).planned")
     assert [pipe["id"] for pipe in planned] == ["still to come"]
+
+
+def test_boards_stand_in_the_view(page: Path, browser: Browser) -> None:
+    browser.open(page, *DESKTOP)
+    assert "boards" in browser.run("document.getElementById('layers').textContent")
+    boards = browser.run("JSON.parse(document.getElementById('view-data').textContent).boards")
+    assert [(board["name"], len(board["lines"])) for board in boards] == [("A", 5)], "its edge and four circles"

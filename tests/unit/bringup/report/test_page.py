@@ -249,3 +249,11 @@ def test_the_two_sides_are_those_from_which_the_pipes_are_seen() -> None:
     assert first[1] < 0
     assert second[1] < 0
     assert np.degrees(np.arccos(first[:2] @ second[:2])) >= 49
+
+
+def test_a_place_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+    begun = []
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="choose another --out"):
+        report([survey(tmp_path / "run")], tmp_path / "file" / "report.html", False, lambda *shown: begun.append(shown))
+    assert not begun

@@ -6,7 +6,7 @@ const frame = document.getElementById("view");
 const rows = [...document.querySelectorAll(".pipe")];
 const panel = document.getElementById("selected");
 const read = (id) => JSON.parse(document.getElementById(id).textContent);
-const {pipes, cameras, planned, previous} = read("view-data");
+const {pipes, cameras, boards, planned, previous} = read("view-data");
 
 let renderer;
 try {
@@ -87,11 +87,22 @@ function frusta() {
   return lines;
 }
 
+function plates() { // the edge and the circles of each board
+  const places = boards.flatMap(({lines}) => lines).flatMap((line) =>
+    line.flatMap((corner, number) => [...corner, ...line[(number + 1) % line.length]]));
+  if (!places.length) return null;
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(places), 3));
+  const lines = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({color: 0x101010}));
+  lines.frustumCulled = false;
+  return lines;
+}
+
 const own = (pipe) => new THREE.Color().setRGB(...pipe.color, "srgb");
 const solid = cylinders(pipes, new THREE.MeshLambertMaterial(), own);
 const ghosts = cylinders(previous, new THREE.MeshBasicMaterial({transparent: true, opacity: 0.35}), () => new THREE.Color(0.35, 0.35, 0.4));
 const plans = cylinders(planned, new THREE.MeshBasicMaterial({transparent: true, opacity: 0.3}), own);
-const layers = {"cloud": cloud(), "pipes": solid, "cameras": frusta(), "planned, not installed": plans, "pipes of the survey before": ghosts};
+const layers = {"cloud": cloud(), "pipes": solid, "cameras": frusta(), "boards": plates(), "planned, not installed": plans, "pipes of the survey before": ghosts};
 for (const [name, object] of Object.entries(layers)) {
   if (!object) continue;
   scene.add(object);
