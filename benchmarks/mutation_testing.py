@@ -143,7 +143,7 @@ MUTANTS = {
         "detect/test_node.py",
     ),
     "detector's node: stamp of the newest status on the pipes": Mutant(
-        "pipeprog_node.received_maps.sfm_status",
+        "pipeprog_node.received.maps.sfm_status",
         "checked_stamp(message.map_stamp)",
         "checked_stamp(message.header.stamp)",
         "detect/test_node.py",

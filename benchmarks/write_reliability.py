@@ -27,7 +27,7 @@ What cannot be used ends the command with one sentence that names the file, the 
 LAZ is decompressed in a process of its own: its decoder recurses as deep as the compressed bits say, which no check of sizes bounds.
 
 A node has one door, `pipeprog_node.intake.Intake`.
-Each type of message is checked in one function of a `received` module of `pipeprog_node`: finite numbers, sizes that fit their data, unit quaternions, counts, stamps that are times, the size of an image from its header before a pixel is decoded.
+Each type of message is checked in one function of the room `pipeprog_node/received`: finite numbers, sizes that fit their data, unit quaternions, counts, stamps that are times, the size of an image from its header before a pixel is decoded.
 Settings are read-only parameters; a request that cannot be met is answered with the reason.
 
 A message that fails is dropped.

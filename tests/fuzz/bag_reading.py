@@ -15,7 +15,8 @@ from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.playback.player import Player, calibration
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.results.result_files import FrameRow
-from pipeprog_node import messages, received_images
+from pipeprog_node import messages
+from pipeprog_node.received import images as received_images
 
 _DOORS: dict[Any, Callable[[Any], Any]] = {
     CompressedImage: received_images.compressed_image,

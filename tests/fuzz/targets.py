@@ -45,7 +45,11 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_boq
 from pipeprog_detect.types import Cylinder
 from pipeprog_frames.incoming.decoding import decode_reduced
-from pipeprog_node import received_header, received_images, received_keyframes, received_maps, received_motion
+from pipeprog_node.received import header as received_header
+from pipeprog_node.received import images as received_images
+from pipeprog_node.received import keyframes as received_keyframes
+from pipeprog_node.received import maps as received_maps
+from pipeprog_node.received import motion as received_motion
 from pipeprog_sfm.boards.board_file import load_board_file
 from tests.fuzz.attempts import Target
 from tests.fuzz.fuzzed_messages import IMAGES, fuzzed_message, good_messages
@@ -396,11 +400,11 @@ def _samples(message_type: Any) -> list[Any]:
 
 @cache
 def _checks(message_type: Any) -> list[Callable[[Any], object]]:
-    """The functions of the modules `received_*` that take messages of this type."""
+    """The functions of the room `received` that take messages of this type."""
     found = []
     modules = received_header, received_images, received_keyframes, received_maps, received_motion
     for name, function in [item for module in modules for item in vars(module).items()]:
-        own = getattr(function, "__module__", "").startswith("pipeprog_node.received_")
+        own = getattr(function, "__module__", "").startswith("pipeprog_node.received.")
         if not own or name.startswith("_") or isinstance(function, type) or function in found:
             continue
         hints = [hint for name, hint in typing.get_type_hints(function).items() if name != "return"]

@@ -39,7 +39,7 @@ GLUE = {
         "keyframe_input",
         "messages",
         "main",
-        *{"received_header", "received_images", "received_keyframes", "received_maps", "received_motion"},
+        *{"header", "images", "keyframes", "maps", "motion"},  # the room received
         "renewal",
         "worker",
     },
@@ -52,6 +52,7 @@ GLUE = {
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
 # and all may import config.py and types.py.
 FOLDERS = {
+    "pipeprog_node": {"received": {"messages", "intake"}},
     "pipeprog_sfm": {
         "features": set(),
         "sparse": {"features"},

@@ -43,15 +43,17 @@ from pipeprog_detect.worker import (
     serve,
 )
 from pipeprog_msgs import msg
-from pipeprog_node import messages, qos, received_images, received_maps
+from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import IMAGES, REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
-from pipeprog_node.received_images import ReceivedCamera
-from pipeprog_node.received_maps import ReceivedCloud, ReceivedPoses, ReceivedStatus, ReceivedVelocities
+from pipeprog_node.received import images as received_images
+from pipeprog_node.received import maps as received_maps
+from pipeprog_node.received.images import ReceivedCamera
+from pipeprog_node.received.maps import ReceivedCloud, ReceivedPoses, ReceivedStatus, ReceivedVelocities
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 

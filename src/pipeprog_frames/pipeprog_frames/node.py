@@ -28,13 +28,15 @@ from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.rig_selection import ONE, RigSelection
 from pipeprog_frames.selection import Selected
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
-from pipeprog_node import messages, qos, received_images, received_keyframes
+from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.discovery import stages_subscribed
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
+from pipeprog_node.received import images as received_images
+from pipeprog_node.received import keyframes as received_keyframes
 
 ArrivedCalibration = tuple[str, int, Camera | None]  # name of its camera, stamp [ns], None where it cannot be used
 STAGES = 2  # nodes of the graph that take keyframes: SfM and detector

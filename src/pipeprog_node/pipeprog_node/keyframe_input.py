@@ -10,9 +10,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.limits import MAX_CAMERAS, MAX_ENCODED_IMAGE, MAX_UNPAIRED
-from pipeprog_node import messages, qos, received_images
+from pipeprog_node import messages, qos
 from pipeprog_node.intake import Intake, InvalidMessageError
-from pipeprog_node.received_images import ReceivedCamera, ReceivedImage
+from pipeprog_node.received import images as received_images
+from pipeprog_node.received.images import ReceivedCamera, ReceivedImage
 
 IMAGES, CALIBRATIONS = "keyframes/image/compressed", "keyframes/camera_info"
 # The camera as the survey's images tell it, where it differs from the calibration: with the stamp of a map.

@@ -29,7 +29,7 @@ from pipeprog_camera.limits import (
     MAX_WAITING_MOTION,
 )
 from pipeprog_msgs import msg
-from pipeprog_node import messages, qos, received_keyframes, received_motion
+from pipeprog_node import messages, qos
 from pipeprog_node.camera_transforms import FRAME, CameraTransforms
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
@@ -37,8 +37,10 @@ from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
-from pipeprog_node.received_keyframes import ReceivedRetirement
-from pipeprog_node.received_motion import ReceivedAcceleration, ReceivedTransform, ReceivedTransforms
+from pipeprog_node.received import keyframes as received_keyframes
+from pipeprog_node.received import motion as received_motion
+from pipeprog_node.received.keyframes import ReceivedRetirement
+from pipeprog_node.received.motion import ReceivedAcceleration, ReceivedTransform, ReceivedTransforms
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.alignment.map_file import read_map

@@ -13,8 +13,8 @@ import numpy as np
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.node import MapInput
-from pipeprog_node.received_images import ReceivedCamera
-from pipeprog_node.received_maps import ReceivedCloud, ReceivedPoses, ReceivedStatus
+from pipeprog_node.received.images import ReceivedCamera
+from pipeprog_node.received.maps import ReceivedCloud, ReceivedPoses, ReceivedStatus
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 REFINED = replace(CAMERA, fx=50.5, fy=50.5, distortion=(0.1, 0.0, 0.0, 0.0))

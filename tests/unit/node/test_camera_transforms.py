@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tf2_msgs.msg import TFMessage
 
-from pipeprog_node import messages, received_motion
+from pipeprog_node import messages
 from pipeprog_node.camera_transforms import CameraTransforms
 from pipeprog_node.intake import Intake
+from pipeprog_node.received import motion as received_motion
 from pipeprog_sfm.node import MotionInput
 from tests.unit.sfm.test_node import Topics
 

@@ -11,8 +11,9 @@ from std_msgs.msg import Header
 
 from pipeprog_camera.limits import MAX_POSES
 from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray, KeyframesRetired
-from pipeprog_node import messages, received_keyframes
+from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
+from pipeprog_node.received import keyframes as received_keyframes
 
 
 def overlaps(**changes: Any) -> ImageOverlapArray:

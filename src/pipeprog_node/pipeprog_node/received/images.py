@@ -14,7 +14,7 @@ from pipeprog_camera.encoded_image import check_bytes, check_size, encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
-from pipeprog_node.received_header import stamp_and_frame
+from pipeprog_node.received.header import stamp_and_frame
 
 
 @dataclass(frozen=True)

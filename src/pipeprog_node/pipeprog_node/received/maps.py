@@ -23,7 +23,7 @@ from pipeprog_camera.rolling_shutter import check_readout
 from pipeprog_msgs.msg import KeyframeVelocities, SfmStatus
 from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
-from pipeprog_node.received_header import checked_stamp, stamp_and_frame
+from pipeprog_node.received.header import checked_stamp, stamp_and_frame
 
 
 @dataclass(frozen=True)

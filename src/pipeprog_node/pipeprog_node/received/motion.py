@@ -23,7 +23,7 @@ from pipeprog_camera.limits import (
     MAX_TRANSFORMS,
 )
 from pipeprog_node.intake import InvalidMessageError
-from pipeprog_node.received_header import stamp_and_frame
+from pipeprog_node.received.header import stamp_and_frame
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
 
 from pipeprog_camera.camera import Camera
-from pipeprog_node import messages, received_images
+from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
+from pipeprog_node.received import images as received_images
 
 CAMERA = Camera(1280, 720, 900.0, 901.0, 639.5, 359.5, "plumb_bob", (-0.2, 0.05, 0.001, -0.0005, 0.0))
 K = CAMERA.matrix.ravel()

@@ -16,8 +16,9 @@ from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_NAME, MAX_QUATERNION_ERROR, MAX_SECONDS
-from pipeprog_node import received_header, received_motion
 from pipeprog_node.intake import InvalidMessageError
+from pipeprog_node.received import header as received_header
+from pipeprog_node.received import motion as received_motion
 
 TURN = math.sqrt(0.5)
 

@@ -22,8 +22,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2, PointField
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.limits import MAX_CLOUD_FIELDS, MAX_CLOUD_POINTS, MAX_COORDINATE, MAX_POSES
 from pipeprog_msgs.msg import KeyframeVelocities, SfmStatus
-from pipeprog_node import messages, received_images, received_maps
+from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
+from pipeprog_node.received import images as received_images
+from pipeprog_node.received import maps as received_maps
 
 CAMERA = Camera(1280, 720, 900.0, 901.0, 639.5, 359.5)
 STAMP = 17

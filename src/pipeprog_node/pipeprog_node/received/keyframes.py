@@ -11,7 +11,7 @@ from pipeprog_camera.limits import (
 )
 from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_node.intake import InvalidMessageError
-from pipeprog_node.received_header import checked_stamp, stamp_and_frame
+from pipeprog_node.received.header import checked_stamp, stamp_and_frame
 
 
 @dataclass(frozen=True)
