@@ -28,9 +28,9 @@ from pipeprog_camera.camera import Camera
 from pipeprog_detect.look.colour_view import NO_CIRCLES, BoardCircles, ColourImage
 from pipeprog_detect.look.look_features import NAMES
 from pipeprog_detect.look.material_model import material_probabilities
+from pipeprog_detect.plan.materials import MATERIALS
 from pipeprog_detect.product.boq import BillLine, BillOfQuantities, PipeClass
 from pipeprog_detect.product.classification import classified_by_look
-from pipeprog_detect.product.materials import MATERIALS
 from pipeprog_detect.types import Cylinder, Pipe, View
 
 FIRST_SEED = 100_000  # none of these is among those that the model was trained on

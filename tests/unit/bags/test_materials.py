@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeprog_detect.plan.materials import MATERIALS
 from pipeprog_detect.product.boq import load_boq
-from pipeprog_detect.product.materials import MATERIALS
 from sitegen import primitives as shapes
 from sitegen.pipe_materials import KINDS, pipe_material
 from sitegen.primitives import Material

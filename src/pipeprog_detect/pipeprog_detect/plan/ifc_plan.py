@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_IFC, MAX_NAME, MAX_PIPES
 from pipeprog_camera.text_file import require_regular
 from pipeprog_detect.plan.entry import Entry, Segment
+from pipeprog_detect.plan.materials import known_material
 
 _INSTALL = "plans in IFC need IfcOpenShell: `pip install ifcopenshell==0.9.0.post1` (or `make setup EXCHANGE=1`)"
 _NESTED = 8  # mapped items within each other; exporters write one
@@ -41,10 +42,11 @@ class _Straight:
     type_name: str
     place: tuple[str, str, str]  # system, zone, activity
     days: tuple[str, str]  # planned start and finish, ISO dates or empty
+    material: str  # one that can be seen, or empty
 
 
 def ifc_entries(path: Path) -> list[Entry]:
-    """The pipes of an IFC file as entries of a bill, one for each size in each system, zone and activity.
+    """The pipes of an IFC file as entries of a bill, one for each size and material in each system, zone and activity.
 
     Raises InputError where it is none, holds no straight pipe with a place, or IfcOpenShell is not installed.
     """
@@ -76,8 +78,10 @@ def _read_in_child(path: Path) -> list[_Straight]:
     if problem:
         raise InputError(f"{path} {problem}")
     return [
-        _Straight(Segment(identity, name, np.array(start), np.array(end)), radius, kind, tuple(place), tuple(days))
-        for identity, name, start, end, radius, kind, place, days in rows
+        _Straight(
+            Segment(identity, name, np.array(start), np.array(end)), radius, kind, tuple(place), tuple(days), look
+        )
+        for identity, name, start, end, radius, kind, place, days, look in rows
     ]
 
 
@@ -89,7 +93,8 @@ def _serve() -> None:
     try:
         for one in _straights(ifcopenshell.open(sys.argv[1])):
             ends = one.segment.start.tolist(), one.segment.end.tolist()
-            pipes.append([one.segment.id, one.segment.name, *ends, one.radius, one.type_name, one.place, one.days])
+            own = one.radius, one.type_name, one.place, one.days, one.material
+            pipes.append([one.segment.id, one.segment.name, *ends, *own])
     except MemoryError:
         problem = "does not fit into memory: export the pipes' discipline alone"
     except InputError as error:
@@ -102,34 +107,41 @@ def _serve() -> None:
 
 
 def _entries(path: str, straights: Sequence[_Straight]) -> list[Entry]:
-    groups: dict[tuple[float, tuple[str, str, str]], list[_Straight]] = {}
-    radii: dict[str, set[float]] = {}
+    # A class is told by its material where all of its size have one.
+    open_sizes = {one.radius for one in straights if not one.material}
+    straights = [replace(one, material="") if one.radius in open_sizes else one for one in straights]
+    groups: dict[tuple[float, str, tuple[str, str, str]], list[_Straight]] = {}
+    kinds: dict[str, set[tuple[float, str]]] = {}
     for one in straights:
-        groups.setdefault((one.radius, one.place), []).append(one)
-        radii.setdefault(one.type_name, set()).add(one.radius)
+        groups.setdefault((one.radius, one.material, one.place), []).append(one)
+        kinds.setdefault(one.type_name, set()).add((one.radius, one.material))
     entries = []
-    for (radius, place), group in groups.items():
+    for (radius, material, place), group in groups.items():
         values: dict[str, object] = {
-            "name": _group_name(radius, group, radii),
+            "name": _group_name(group, kinds),
             "outer_radius_mm": round(1e3 * radius, 6),
             "planned_length_m": round(sum(float(np.linalg.norm(o.segment.end - o.segment.start)) for o in group), 6),
         }
         starts, finishes = ([day for day in days if day] for days in zip(*(one.days for one in group), strict=True))
         texts = dict(zip(("system", "zone", "activity"), place, strict=True))
-        texts |= {"start": min(starts, default=""), "finish": max(finishes, default="")}
+        texts |= {"start": min(starts, default=""), "finish": max(finishes, default=""), "material": material}
         values |= {key: text for key, text in texts.items() if text}
         entries.append(Entry(path, values, tuple(one.segment for one in group)))
     return entries
 
 
-def _group_name(radius: float, group: Sequence[_Straight], radii: dict[str, set[float]]) -> str:
-    """Names of the pipes' types; with the size where a type has several, or none has a name."""
+def _group_name(group: Sequence[_Straight], kinds: dict[str, set[tuple[float, str]]]) -> str:
+    """Names of the pipes' types; with size and material where a type has several of them, or none has a name."""
     names = sorted({one.type_name for one in group if one.type_name})
-    size = f"{2e3 * radius:g} mm"
+    words = f"{2e3 * group[0].radius:g} mm", group[0].material
     if not names:
-        return size
-    text = " + ".join(name if len(radii[name]) == 1 else f"{name} {size}" for name in names)
-    return text if len(text) <= MAX_NAME // 2 else f"{names[0][: MAX_NAME // 4]} {size}"
+        return " ".join(words).strip()
+    parts = []
+    for name in names:
+        differ = [len(set(values)) > 1 for values in zip(*kinds[name], strict=True)]
+        parts += [" ".join([name, *(word for word, differs in zip(words, differ, strict=True) if word and differs)])]
+    text = " + ".join(parts)
+    return text if len(text) <= MAX_NAME // 2 else " ".join([names[0][: MAX_NAME // 4], *words]).strip()
 
 
 def _straights(model: Any) -> list[_Straight]:
@@ -150,7 +162,8 @@ def _straights(model: Any) -> list[_Straight]:
         if np.linalg.norm(end - start) > 0.0 < radius:
             segment = Segment(str(element.GlobalId), _text(element.Name), start, end)
             rounded = round(round(radius / _STEP) * _STEP, 9)
-            found.append(_Straight(segment, rounded, _type_name(element), _belongs_to(element), _days(element)))
+            own = _type_name(element), _belongs_to(element), _days(element), _material(element)
+            found.append(_Straight(segment, rounded, *own))
     return found
 
 
@@ -262,6 +275,14 @@ def _type_name(element: Any) -> str:
 
     kind = get_type(element)
     return _text(kind.Name if kind is not None and kind.Name else element.ObjectType)
+
+
+def _material(element: Any) -> str:
+    """The material of a pipe or its type that keyframes can tell; empty where it has none, or several."""
+    from ifcopenshell.util.element import get_materials
+
+    found = {known_material(_text(material.Name)) for material in get_materials(element)}
+    return found.pop() if len(found) == 1 else ""
 
 
 def _text(value: Any) -> str:

@@ -14,9 +14,9 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CLASSES, MAX_NAME, MAX_PIPE_LENGTH, MAX_PIPE_RADIUS, MIN_PIPE_RADIUS
 from pipeprog_camera.outside_text import name_of, nearest, shown
 from pipeprog_detect.plan.entry import Entry, Segment
+from pipeprog_detect.plan.materials import MATERIALS, read_material
 from pipeprog_detect.plan.plan_file import read_plan
 from pipeprog_detect.product.class_colors import Color, distinct_colors, read_color
-from pipeprog_detect.product.materials import MATERIALS, read_material
 from pipeprog_detect.product.standard_sizes import find_size, nearest_name
 from pipeprog_detect.product.unit_check import WrittenSize, ask_about_units
 from pipeprog_detect.types import Cylinder

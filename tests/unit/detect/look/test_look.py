@@ -17,8 +17,8 @@ from pipeprog_detect.look.colour_view import NO_CIRCLES, BoardCircles, ColourIma
 from pipeprog_detect.look.look_features import NAMES, look_features
 from pipeprog_detect.look.material_model import material_probabilities
 from pipeprog_detect.look.told_by_look import Seen, told_by_look
+from pipeprog_detect.plan.materials import MATERIALS
 from pipeprog_detect.product.boq import BillLine, BillOfQuantities, PipeClass
-from pipeprog_detect.product.materials import MATERIALS
 from pipeprog_detect.types import Cylinder, Pipe, View
 
 CAMERA = Camera(640, 360, 460.0, 460.0, 319.5, 179.5)

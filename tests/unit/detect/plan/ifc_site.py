@@ -18,9 +18,22 @@ def write_plan_ifc(
     millimetres: bool = True,
     mapped: bool = False,
     systems: dict[str, str] | None = None,
+    materials: dict[str, str] | None = None,
 ) -> None:
     """Pipes by name, type and place; in the file's unit, placed relative to a storey that is turned and moved."""
-    from ifcopenshell.api import aggregate, context, geometry, profile, project, root, spatial, system, type, unit
+    from ifcopenshell.api import (
+        aggregate,
+        context,
+        geometry,
+        material,
+        profile,
+        project,
+        root,
+        spatial,
+        system,
+        type,
+        unit,
+    )
 
     file = project.create_file(version="IFC4")
     whole = root.create_entity(file, "IfcProject", name="Plan")
@@ -55,6 +68,9 @@ def write_plan_ifc(
                 groups[systems[name]] = system.add_system(file, ifc_class="IfcDistributionSystem")
                 groups[systems[name]].Name = systems[name]
             system.assign_system(file, products=[segment], system=groups[systems[name]])
+        if materials:
+            made_of = material.add_material(file, name=materials[name])
+            material.assign_material(file, products=[segment], material=made_of)
     file.write(str(path))
 
 

@@ -56,6 +56,21 @@ def test_a_type_of_several_sizes_and_two_systems_of_one_size(tmp_path: Path) -> 
 
 
 @needs_ifc
+def test_pipes_of_one_size_are_told_apart_by_their_materials(tmp_path: Path) -> None:
+    pipes = [(name, "Pipe", place) for name, _, place in PIPES]
+    write_plan_ifc(tmp_path / "plan.ifc", pipes, materials={"a": "Kupfer", "b": "steel, galvanised", "c": "Copper"})
+    unknown = load_boq(tmp_path / "plan.ifc")
+    assert [one.material for one in unknown.classes] == ["", "copper"], "not all of 114.3 mm have a known one"
+    write_plan_ifc(tmp_path / "plan.ifc", pipes, materials={"a": "Kupfer", "b": "Grey PVC", "c": "Copper"})
+    plan = load_boq(tmp_path / "plan.ifc")
+    assert [(one.name, one.material) for one in plan.classes] == [
+        ("Pipe 114.3 mm copper", "copper"),
+        ("Pipe 114.3 mm PVC grey", "PVC grey"),
+        ("Pipe 60.3 mm copper", "copper"),
+    ]
+
+
+@needs_ifc
 @pytest.mark.parametrize(
     "text",
     [

@@ -41,16 +41,22 @@ _SLIP = 0.8
 
 
 def read_material(where: str, value: object) -> str:
-    """The material of `MATERIALS` that a bill's text means, whatever the order of its words; else the text.
+    """The material of `MATERIALS` that a bill's text means; else the text.
 
     Raises InputError, which begins with `where`, for a text that is nearly a material.
     """
     text = name_of(value, f"{where}: material")
-    words = frozenset(_WORDS.get(word, word) for word in re.split(r"[\s,_-]+", text.lower()) if word)
-    if words in _BY_WORDS:
-        return _BY_WORDS[words]
+    known = known_material(text)
+    if known:
+        return known
     near = difflib.get_close_matches(text.lower(), [material.lower() for material in MATERIALS], 1, _SLIP)
     if near:
         meant = next(material for material in MATERIALS if material.lower() == near[0])
         raise InputError(f"{where}: unknown material {shown(text)}: did you mean '{meant}'?")
     return text
+
+
+def known_material(text: str) -> str:
+    """The material of `MATERIALS` that a text means, whatever the order of its words; empty where it means none."""
+    words = frozenset(_WORDS.get(word, word) for word in re.split(r"[\s,_-]+", text.lower()) if word)
+    return _BY_WORDS.get(words, "")

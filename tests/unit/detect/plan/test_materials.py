@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.errors import InputError
+from pipeprog_detect.plan.materials import read_material
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.classification import asks_look, classified_by_look, classify
-from pipeprog_detect.product.materials import read_material
 from pipeprog_detect.types import Cylinder, Pipe
 
 LINE = "  - {{name: {0}, outer_radius_mm: {1}, planned_length_m: 3, {2}}}\n"
