@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can be told of a recording before a survey: by `pipeprog check`, and at the start of each replay.
 
-A survey needs at least three images, some that are not black, and something that tells the scale.
+A survey needs at least four images, some that are not black, and something that tells the scale.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.ellipses import detect_ellipses
 from pipeprog_sfm.config import BoardConfig
 
-MIN_FRAMES = 3  # two give a first model, and the third is the first that checks it
+MIN_FRAMES = 4  # points and outlines count where three views agree; of three images none may be lost or stand alone
 SCALE_TOPICS = {"odometry", "/tf", "/tf_static"}  # of the graph; odometry, odometry in TF, the bodies of a camera rig
 _SAMPLE = 12  # frames looked at: a board that a third of the frames show is missed once in 130 recordings
 _SECONDS = 3.0  # for reading at the start of a replay; what is not read by then counts for nothing

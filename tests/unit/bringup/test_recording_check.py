@@ -65,8 +65,8 @@ def test_a_board_that_no_frame_shows_gives_no_result(tmp_path: Path, board_file:
 def test_black_frames_few_frames_and_no_scale_are_refused_at_once(tmp_path: Path, board_file: BoardFile) -> None:
     (black,) = recording_check.faults_of(bag_of(tmp_path, np.full((240, 320), 3, np.uint8)), board_file)
     assert "all 4 frames looked at are black" in black
-    few, scale = recording_check.faults_of(bag_of(tmp_path, picture_of_the_board(), 2), BoardFile())
-    assert "has 2 images on /camera/image/compressed: a survey needs 3" in few
+    few, scale = recording_check.faults_of(bag_of(tmp_path, picture_of_the_board(), 3), BoardFile())
+    assert "has 3 images on /camera/image/compressed: a survey needs 4" in few
     assert "nothing tells the scale" in scale
     assert recording_check.faults_of(bag_of(tmp_path, picture_of_the_board()), board_file) == []
 
