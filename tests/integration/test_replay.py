@@ -154,7 +154,8 @@ def test_every_frame_is_considered_and_the_results_are_written(tmp_path: Path) -
         m.message.log_time: m.decoded_message for m in decoded if m.channel.topic == "/keyframes/image/compressed"
     }
     moved = {m.message.log_time: m.decoded_message.transforms for m in decoded if m.channel.topic == "/tf"}
-    assert moved.keys() == images.keys(), "each keyframe has its place"
+    outlined = {m.message.log_time for m in decoded if m.channel.topic == "/keyframes/outlines"}
+    assert outlined == moved.keys() == images.keys(), "each keyframe has its place and its outlines"
     for stamp, (transform,) in moved.items():
         assert (transform.header.frame_id, transform.child_frame_id) == ("map", images[stamp].header.frame_id)
         assert str(transform.header.stamp) == str(images[stamp].header.stamp), "decoded as two classes of one name"

@@ -44,7 +44,7 @@ GLUE = {
         "worker",
     },
     "pipeprog_bringup": {
-        *{"replay", "session", "connections", "player", "listener", "survey_writer"},
+        *{"replay", "session", "connections", "player", "listener", "survey_writer", "outline_marker"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},
         *{"survey_client", "conduct"},
     },

@@ -35,7 +35,7 @@ def test_foxglove_shows_topics_of_a_survey() -> None:
     panels = layout["configById"]
     topics = {topic for panel in panels.values() for topic in panel.get("topics", {})}
     image = panels["Image!pipeprog"]["imageMode"]
-    topics |= {image["imageTopic"], image["calibrationTopic"]}
+    topics |= {image["imageTopic"], image["calibrationTopic"], *image["annotations"]}
     topics |= {panel["topicPath"].split(".")[0] for panel in panels.values() if "topicPath" in panel}
     assert topics <= recorded()
 

@@ -8,13 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, Transform, TransformStamped, Vector3
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import ColorRGBA
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import ImageMarker, Marker
 
 from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.playback.listener import LastMessages
+from pipeprog_bringup.playback.outline_marker import outline_marker
 from pipeprog_bringup.playback.player import calibration
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
@@ -142,37 +144,32 @@ def record_keyframes(recording: BagWriter, bag: Bag, log: FrameLog, survey: Last
 
 
 def record_cameras(recording: BagWriter, survey: LastMessages, infos: Mapping[int, CameraInfo]) -> dict[int, Camera]:
-    """Write calibration and transform of the keyframes in out.mcap; returns their cameras by stamp.
+    """Write calibration, transform and pipes' outlines of the keyframes in out.mcap; returns their cameras by stamp.
 
     `infos`: the calibrations that were sent with them, by stamp; what the survey has refined goes before.
     """
     cameras = {}
-    places = {messages.stamp_ns(place.header.stamp): place for place in survey.poses.poses}
+    stamps, poses = messages.poses_from_path(survey.poses)
+    places = dict(zip(stamps.tolist(), poses, strict=True))
+    pipes = _colored(survey)
     refined = None if survey.refined is None else messages.camera_from_info(survey.refined)
     for stamp, sent in infos.items():
         used = messages.info_from_camera(refined, stamp, sent.header.frame_id) if refined else sent
         cameras[stamp] = messages.camera_from_info(used)
         recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, serialize_message(used), stamp)
         if stamp in places:
-            moved = _transform(places[stamp], sent.header.frame_id)
+            moved = TFMessage(transforms=[messages.transform(stamp, "map", sent.header.frame_id, places[stamp])])
             recording.write("/tf", cdr.TF, serialize_message(moved), stamp)
+            outlines = outline_marker(stamp, sent.header.frame_id, cameras[stamp], places[stamp], pipes)
+            recording.write("/keyframes/outlines", type_name(ImageMarker), serialize_message(outlines), stamp)
     return cameras
 
 
-def _transform(place: PoseStamped, camera: str) -> TFMessage:
-    """The transform from `map` to a camera's frame, by which viewers stand its image in the map."""
-    pose = place.pose
-    position = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
-    transform = Transform(translation=position, rotation=pose.orientation)
-    return TFMessage(
-        transforms=[
-            TransformStamped(
-                header=messages.header(messages.stamp_ns(place.header.stamp), "map"),
-                child_frame_id=camera,
-                transform=transform,
-            )
-        ]
-    )
+def _colored(survey: LastMessages) -> list[tuple[Cylinder, ColorRGBA]]:
+    """The pipes with the colours of their markers; black without one."""
+    colors = {marker.id: marker.color for marker in survey.markers.markers if marker.type == Marker.CYLINDER}
+    black = ColorRGBA(a=1.0)
+    return [(_pipe(pipe).cylinder, colors.get(number, black)) for number, pipe in enumerate(survey.pipes.pipes)]
 
 
 def type_name(kind: type) -> str:

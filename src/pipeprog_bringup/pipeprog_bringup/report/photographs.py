@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_bringup.results.pipe_outlines import NEAR, inside, outline, project
 from pipeprog_bringup.results.results_reader import Results
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
@@ -21,7 +22,6 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.types import Cylinder
 
 SAMPLES = 25  # positions along an axis at which it is asked whether a keyframe shows it
-NEAR = 0.05  # m; nearer to the camera nothing is projected
 CELL = 16  # px of a keyframe, the side of a cell of the depth map of what hides a pipe
 HIDDEN = 0.1  # m by which the cloud lies before a pipe's surface where it hides it: noise and neighbours touching it
 WHOLE = 0.9  # share of a pipe's length that a photograph shows where it counts as the whole pipe
@@ -94,11 +94,11 @@ def sight(views: Sequence[tuple[Camera, FloatArray]], cylinders: Sequence[Cylind
     size = np.zeros((len(views), len(cylinders)))
     direction = np.zeros((len(views), len(cylinders), 3))
     for number, (camera, pose) in enumerate(views):
-        pixels, depth = _project(camera, pose, axes.reshape(-1, 3))
+        pixels, depth = project(camera, pose, axes.reshape(-1, 3))
         nearest = _nearest(camera, pose, points)
         rows, columns = _cells(camera, pixels)
         front = depth - np.repeat(radii, SAMPLES)
-        shown = _inside(camera, pixels) & (front > NEAR)
+        shown = inside(camera, pixels) & (front > NEAR)
         shown &= nearest[rows, columns] > front - HIDDEN
         seen[number] = shown.reshape(-1, SAMPLES)
         steps = np.linalg.norm(np.diff(pixels.reshape(-1, SAMPLES, 2), axis=1), axis=2)
@@ -129,44 +129,9 @@ def best_views(seen: NDArray[np.bool_], size: FloatArray, direction: FloatArray)
     return [first, second] if gain[second] >= 0.1 else [first]
 
 
-def outline(cylinder: Cylinder, centre: FloatArray) -> FloatArray:
-    """(N, 3) closed line around what a camera at `centre` (3,) sees of a cylinder [m]; empty from inside it."""
-    towards = cylinder.from_axis(centre[None])[0]
-    distance = float(np.linalg.norm(towards))
-    if distance <= cylinder.radius:
-        return np.empty((0, 3))
-    near = towards / distance
-    aside = np.cross(cylinder.axis, near)
-    # The surface turns away from the camera where its normal is at right angles to the line of sight.
-    turn = math.acos(cylinder.radius / distance)
-    line = cylinder.at(np.linspace(0.0, 1.0, SAMPLES))
-    sides = [cylinder.radius * (math.cos(turn) * near + sign * math.sin(turn) * aside) for sign in (1.0, -1.0)]
-    return np.concatenate([line + sides[0], line[::-1] + sides[1]])
-
-
 def _each_pipe(found: Sight) -> list[tuple[NDArray[np.bool_], FloatArray, FloatArray]]:
     count = found.size.shape[1]
     return [(found.seen[:, pipe], found.size[:, pipe], found.direction[:, pipe]) for pipe in range(count)]
-
-
-def _project(camera: Camera, pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) of the image as it was taken, and depths (N,) [m], of points (N, 3) of the map."""
-    in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
-    depth = in_camera[:, 2]
-    rays = in_camera[:, :2] / np.maximum(depth, NEAR)[:, None]
-    # Beyond the corners of the image a polynomial of the lens may fold back into it.
-    corners = np.array([[x, y] for x in (0, 0.5, 1) for y in (0, 0.5, 1)]) * [camera.width - 1, camera.height - 1]
-    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    reach = 1.2 * np.abs((camera.undistort_points(corners) - centre) / focal).max(axis=0)
-    beyond = (depth < NEAR) | (np.abs(rays) > reach).any(axis=1)
-    pixels = camera.distort_points(np.clip(rays, -reach, reach) * focal + centre)
-    pixels[beyond] = np.clip(rays[beyond], -10.0, 10.0) * focal + centre
-    pixels[beyond & _inside(camera, pixels)] = -1.0
-    return pixels, depth
-
-
-def _inside(camera: Camera, pixels: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1))
 
 
 def _cells(camera: Camera, pixels: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -179,8 +144,8 @@ def _nearest(camera: Camera, pose: FloatArray, points: FloatArray) -> FloatArray
     """Depth [m] of the nearest point in each cell of CELL px; infinite where there is none."""
     depths = np.full((-(-camera.height // CELL), -(-camera.width // CELL)), np.inf)
     if len(points):
-        pixels, depth = _project(camera, pose, points)
-        shown = _inside(camera, pixels) & (depth > NEAR)
+        pixels, depth = project(camera, pose, points)
+        shown = inside(camera, pixels) & (depth > NEAR)
         rows, columns = _cells(camera, pixels[shown])
         np.minimum.at(depths, (rows, columns), depth[shown])
     return depths
@@ -239,8 +204,8 @@ def _crop(
     edge = outline(cylinder, pose[:3, 3])
     if not len(edge):
         return None
-    pixels, depth = _project(camera, pose, edge)
-    shown = _inside(camera, pixels) & (depth > NEAR)
+    pixels, depth = project(camera, pose, edge)
+    shown = inside(camera, pixels) & (depth > NEAR)
     if not shown.any():
         return None
     low, high = _crop_box(camera, pixels[shown])
@@ -257,8 +222,8 @@ def _crop(
     for tint, width in (([255, 255, 255], 4), (bgr, 2)):
         cv2.polylines(part, polygon, True, tint, width, cv2.LINE_AA, 4)
     encoded = cv2.imencode(".jpg", part, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-    axis, depth = _project(camera, pose, cylinder.at(np.linspace(0.0, 1.0, SAMPLES)))
-    share = float((_inside(camera, axis) & (depth > NEAR)).mean())
+    axis, depth = project(camera, pose, cylinder.at(np.linspace(0.0, 1.0, SAMPLES)))
+    share = float((inside(camera, axis) & (depth > NEAR)).mean())
     return Photograph(encoded.tobytes(), part.shape[1], part.shape[0], keyframe, share)
 
 
