@@ -24,8 +24,12 @@ def mark(task: Task) -> str:
 
 def digest(task: Task, recording: Path) -> str:
     """Of the input's content; `recording` is the file or folder that has come."""
-    files = sorted(file for file in recording.rglob("*") if file.is_file()) if recording.is_dir() else [recording]
-    return _hash({file.relative_to(recording.parent).as_posix(): _sha256(file) for file in files}, task)
+    return _hash({file.relative_to(recording.parent).as_posix(): _sha256(file) for file in _files(recording)}, task)
+
+
+def state(recording: Path) -> dict[str, tuple[int, int]]:
+    """Size and time of change [ns] of each file: another one means that somebody has written to it."""
+    return {str(file): (file.stat().st_size, file.stat().st_mtime_ns) for file in _files(recording)}
 
 
 def parsed(content: bytes) -> dict[str, Any]:
@@ -41,6 +45,10 @@ def is_whole(run: Mapping[str, Any], files: Mapping[str, Mark]) -> bool:
     """Whether every file that a run.json lists is there with its size."""
     sizes: dict[str, int] = run["fleet"]["sizes"]
     return all(name in files and files[name].size == size for name, size in sizes.items())
+
+
+def _files(recording: Path) -> list[Path]:
+    return sorted(file for file in recording.rglob("*") if file.is_file()) if recording.is_dir() else [recording]
 
 
 def _hash(files: Mapping[str, Any], task: Task) -> str:

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("fsspec", reason="the packages of pipeprog fleet are not installed: make setup FLEET=1")
 
-from pipeprog_bringup.fleet import storage
+from pipeprog_bringup.fleet import fingerprint, storage
 from pipeprog_bringup.fleet.recordings import Inputs, listed
 from pipeprog_bringup.fleet.storage import Place, StorageFailure
 from pipeprog_bringup.fleet.survey import survey
@@ -176,3 +176,31 @@ def test_a_reason_of_the_runner_and_its_log_are_kept(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_text("abc")
     outcome = do(task_of(f"{tmp_path}/a.mcap", f"{tmp_path}/out"), tmp_path / "scratch", refuse)
     assert outcome == Outcome("a", "refused", "no frames", "a log\n")
+
+
+def test_a_recording_without_earlier_results_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A huge one that cannot be surveyed costs what its replay costs to say so."""
+
+    def refuse(task: Task, folder: Path, watcher: Watcher) -> dict[str, Any]:
+        raise Refused("it is no recording", "")
+
+    monkeypatch.setattr(fingerprint, "digest", lambda task, recording: pytest.fail("the recording was read"))
+    (tmp_path / "a.mcap").write_bytes(b"abc")
+    assert do(task_of(str(tmp_path / "a.mcap"), str(tmp_path / "out")), tmp_path / "scratch", refuse).state == "refused"
+
+
+def test_a_recording_that_grows_meanwhile_is_surveyed_again(tmp_path: Path) -> None:
+    bag = tmp_path / "a.mcap"
+
+    def find_while_it_grows(task: Task, folder: Path, watcher: Watcher) -> dict[str, Any]:
+        facts = find(task, folder, watcher)
+        bag.write_bytes(b"abcdef")
+        return facts
+
+    bag.write_bytes(b"abc")
+    task = task_of(str(bag), str(tmp_path / "out"))
+    assert do(task, tmp_path / "first", find_while_it_grows).state == "done"
+    assert do(task_of(str(bag), str(tmp_path / "out")), tmp_path / "second").state == "done"
+    assert do(task_of(str(bag), str(tmp_path / "out")), tmp_path / "third").state == "kept"
