@@ -124,7 +124,9 @@ def make_site(
     if seconds is None:
         seconds = walk.duration if layout == Layout.field else _LAB_SECONDS
     times = np.arange(max(math.floor(seconds * fps), 1)) / fps
-    poses = walk.poses(times)
+    walks: list[Walk | MountedWalk] = [walk, *(MountedWalk(walk, mounted(number)) for number in range(1, rig))]
+    taken = _taken(times, rig, drop, np.random.default_rng([seed, _DROP_SEED]))
+    poses = _poses(walks, taken)
 
     preview = lens.reduced(max(lens.width // _PREVIEW_WIDTH, 1))
     seen = coverage(scene, site.pipes, preview, poses)
@@ -141,9 +143,7 @@ def make_site(
         np.savez_compressed(f"{stem}.surface.npz", points=points, pipe=owners)
     # The recording is written last: where it exists, all files that belong to it exist, too.
     sensor = Sensor(exposure_ms / 1e3, readout_ms / 1e3, blur, noise, quality, site.gain, site.balance)
-    walks: list[Walk | MountedWalk] = [walk, *(MountedWalk(walk, mounted(number)) for number in range(1, rig))]
     shots = [Shot(scene, lens, each, sensor, grey) for each in walks]
-    taken = _taken(times, rig, drop, np.random.default_rng([seed, _DROP_SEED]))
     frames = _frames(shots, taken, seed + _NIGHT_SEED * second_night_later, jobs)
     motion_rng = np.random.default_rng([seed, _MOTION_SEED])
     motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng, rig)
@@ -173,6 +173,15 @@ def _taken(times: NDArray[np.float64], cameras: int, drop: float, rng: np.random
     """Time and number of the camera of each image that does not get lost."""
     taken = [(float(time), camera) for time in times for camera in range(cameras)]
     return [each for each, kept in zip(taken, rng.random(len(taken)) >= drop, strict=True) if kept]
+
+
+def _poses(walks: Sequence[Walk | MountedWalk], taken: Sequence[tuple[float, int]]) -> NDArray[np.float64]:
+    """(N, 4, 4) world_from_camera of the images, in their order."""
+    moments, cameras = (np.array(column) for column in zip(*taken, strict=True))
+    poses = np.empty((len(taken), 4, 4))
+    for number, walk in enumerate(walks):
+        poses[cameras == number] = walk.poses(moments[cameras == number])
+    return poses
 
 
 def _frames(

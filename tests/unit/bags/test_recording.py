@@ -13,6 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
 from sitegen.render import Lens, build_scene
+from sitegen.robot import mounted
 from sitegen.sensor import Sensor, develop, expose
 from sitegen.site import CONCRETE, LAB_RADII, Site
 from sitegen.walk import Walk
@@ -75,6 +76,23 @@ def test_truth_has_the_agreed_members(recording: Path) -> None:
         assert {"id", "start", "end", "radius", "length", "material"} <= set(pipe)
         assert pipe["length"] == pytest.approx(np.linalg.norm(np.subtract(pipe["end"], pipe["start"])))
         assert pipe["radius"] in truth["planned_radii"]
+
+
+def test_the_truth_of_a_rig_has_a_pose_for_each_image_in_their_order(tmp_path: Path) -> None:
+    out = tmp_path / "rig.mcap"
+    run(out, "--rig", "3", "--drop", "0.4", "--size", "vga")
+    images = sorted(
+        (stamp, topic) for topic, sent in messages(out).items() if topic.endswith("compressed") for stamp, _ in sent
+    )
+    poses = np.array(json.loads(out.with_suffix(".truth.json").read_text())["camera_to_world"])
+    assert 2 <= len(images) < 6
+    assert len(poses) == len(images)
+    # Cameras of one time are mounted as they are: a quarter metre and 20 degrees from the first at most.
+    mounts = {f"/camera{number or ''}/image/compressed": mounted(number) for number in range(3)}
+    bodies = [pose @ np.linalg.inv(mounts[topic]) for pose, (_, topic) in zip(poses, images, strict=True)]
+    for (stamp, _), body in zip(images, bodies, strict=True):
+        first = next(k for k, (other, _) in enumerate(images) if other == stamp)
+        assert body == pytest.approx(bodies[first], abs=1e-9)
 
 
 def test_boq_and_board_read_as_yaml(recording: Path) -> None:
