@@ -6,7 +6,8 @@
 Every row is a recording of its own through the graph: rendered anew where the factor is in the scene or the camera's
 motion, made from the frames of the good recording where it is in the image or in its calibration. What was measured is
 kept in out/surveys, so that an interrupted run goes on. Writes results/robustness.json, docs/images/robustness.png; the
-recording guide is made of them (benchmarks.write_accuracy).
+recording guide is made of them (benchmarks.write_accuracy). Each row has its commit; factors that are not named keep
+their rows.
 """
 
 from __future__ import annotations
@@ -118,14 +119,16 @@ FACTORS: dict[str, dict[str, Shot]] = {
 
 def main(factors: list[str]) -> None:
     """Measure, write the rows down after each, and draw."""
-    rows: list[dict[str, Any]] = []
+    target = RESULTS / "robustness.json"
+    known = json.loads(target.read_text())["rows"] if target.exists() else []
+    rows: dict[tuple[str, str], dict[str, Any]] = {(row["factor"], row["value"]): row for row in known}
     for factor in factors or list(FACTORS):
         for value, shot in FACTORS[factor].items():
-            rows.append({"factor": factor, "value": value, **_figures(shot)})
-            content = {"title": TITLE, "command": "python -m benchmarks.robustness", "rows": rows}
-            (RESULTS / "robustness.json").write_text(json.dumps(content, indent=1) + "\n")
-            print(rows[-1], flush=True)
-            _draw(rows)
+            rows[factor, value] = {"factor": factor, "value": value, **_figures(shot)}
+            content = {"title": TITLE, "command": "python -m benchmarks.robustness", "rows": list(rows.values())}
+            target.write_text(json.dumps(content, indent=1) + "\n")
+            print(rows[factor, value], flush=True)
+            _draw(list(rows.values()))
 
 
 def _figures(shot: Shot) -> dict[str, Any]:
@@ -133,7 +136,7 @@ def _figures(shot: Shot) -> dict[str, Any]:
     recording = shot.recording()
     known = attempt(recording, (), f"robustness_{recording.name}")
     if "failed" in known:
-        return {"F": 0.0, "why": known["failed"]}
+        return {"F": 0.0, "why": known["failed"], "commit": known["commit"]}
     return {**score_figures(known["score"]), "commit": known["commit"]}
 
 
