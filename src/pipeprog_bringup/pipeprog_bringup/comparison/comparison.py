@@ -15,7 +15,7 @@ from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.results.lives import NUMBERED
 from pipeprog_bringup.results.results_reader import Results
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.coverage.changes import Change, KnownPipe, changes
+from pipeprog_detect.coverage.changes import UNKNOWN_SIGMA, Change, KnownPipe, changes
 from pipeprog_detect.coverage.places import Sight, sights
 from pipeprog_detect.coverage.survey import views_of
 from pipeprog_detect.types import View
@@ -140,9 +140,16 @@ def _new_life(survey: Results, name: str, lived: Collection[str], number: int) -
 
 def _pipes(results: Results) -> list[KnownPipe]:
     return [
-        KnownPipe(str(row["id"]), cylinder, str(row["class"] or ""), row.get("length_sigma"))
+        KnownPipe(str(row["id"]), cylinder, str(row["class"] or ""), _end_sigmas(row))
         for row, cylinder in zip(results.pipes, results.cylinders, strict=True)
     ]
+
+
+def _end_sigmas(row: dict[str, Any]) -> tuple[float, float]:
+    """Standard deviations [m] of both ends of a row of pipes.json; UNKNOWN_SIGMA for those that it does not tell."""
+    given = [end.get("sigma") for end in row.get("ends", [])]
+    start, end = (UNKNOWN_SIGMA if sigma is None else float(sigma) for sigma in [*given, None, None][:2])
+    return start, end
 
 
 def _check_frames(earlier: Results, later: Results, views: Sequence[View]) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,15 +30,10 @@ def lives_after(reference: SurveyMap, product: Product, views: Sequence[View]) -
     """
     # Pieces of one pipe have one life, and are compared each by itself.
     before = [
-        KnownPipe(
-            pipe.life, Cylinder(pipe.ends[0], pipe.ends[1], pipe.radius), pipe.class_name, _known(pipe.length_sigma)
-        )
+        KnownPipe(pipe.life, Cylinder(pipe.ends[0], pipe.ends[1], pipe.radius), pipe.class_name)
         for pipe in reference.pipes
     ]
-    after = [
-        KnownPipe(pipe.id, pipe.cylinder, pipe.class_name or "", _known(product.length_sigma(pipe)))
-        for pipe in product.pipes
-    ]
+    after = [KnownPipe(pipe.id, pipe.cylinder, pipe.class_name or "") for pipe in product.pipes]
     told = changes(before, after, views)
     most = max((int(found[1]) for pipe in before if (found := NUMBERED.fullmatch(pipe.id))), default=0)
     of: dict[str, str] = {}
@@ -50,7 +44,3 @@ def lives_after(reference: SurveyMap, product: Product, views: Sequence[View]) -
         of |= dict.fromkeys(change.after, life)
     unseen = [pipe for pipe, change in zip(reference.pipes, told, strict=False) if change.state == "not_seen"]
     return Lives(of, tuple(unseen))
-
-
-def _known(sigma: float) -> float | None:
-    return sigma if math.isfinite(sigma) else None

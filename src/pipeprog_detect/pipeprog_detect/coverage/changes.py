@@ -19,19 +19,19 @@ NEAR = 0.02
 ALIGNMENT = 0.003
 PARALLEL = float(np.cos(np.radians(3.0)))
 OVERLAP = 0.3  # of the shorter one
-SIGMAS = 3.0  # of both lengths, by which a pipe is longer or shorter
-UNKNOWN_SIGMA = 0.01  # m, of a length whose sigma is not known: a centimetre at both ends together
+SIGMAS = 3.0  # of an end in both surveys, by which a pipe is longer or shorter there
+UNKNOWN_SIGMA = 0.007  # m, of an end whose sigma is not known: a centimetre at both ends together
 STATES = ("kept", "longer", "shorter", "new", "gone", "not_seen")
 
 
 @dataclass(frozen=True)
 class KnownPipe:
-    """A pipe of a survey: its id, place, class (empty without one) and the standard deviation of its length [m]."""
+    """A pipe of a survey: its id, place, class (empty without one) and the standard deviations of its ends [m]."""
 
     id: str
     cylinder: Cylinder
     class_name: str
-    sigma: float | None = None
+    end_sigmas: tuple[float, float] = (UNKNOWN_SIGMA, UNKNOWN_SIGMA)
 
 
 @dataclass(frozen=True)
@@ -95,20 +95,47 @@ def _shared(old: KnownPipe, new: KnownPipe) -> float:
 def _known(old: KnownPipe, pieces: Sequence[KnownPipe], own: AxisCoverage) -> Change:
     """The change of a pipe that was there before, of which `own` is what the survey after tells of its axis."""
     length, now = old.cylinder.length, sum(piece.cylinder.length for piece in pieces)
-    left = np.ones(len(own.parts), bool)
-    for piece in pieces:
-        ends = np.stack([piece.cylinder.start, piece.cylinder.end])
-        low, high = sorted(float(at) for at in old.cylinder.along(ends))
-        left &= (own.positions() < low) | (own.positions() > high)
-    vanished = own.metres(Sight.EMPTY, within=left)
-    unseen = own.metres(*Sight, within=left) - vanished
     ids = tuple(piece.id for piece in pieces)
     if not pieces:
-        gone = vanished > 0.5 * length
+        gone = own.metres(Sight.EMPTY) > 0.5 * length
         counted = 0.0 if gone else length
         return Change("gone" if gone else "not_seen", old.class_name, (old.id,), ids, length, now, counted)
-    sigmas = [UNKNOWN_SIGMA if one.sigma is None else one.sigma for one in (old, *pieces)]
-    least = SIGMAS * float(np.linalg.norm(sigmas)) + STEP
-    added = now - (length - vanished - unseen)
-    state = "shorter" if vanished > least else "longer" if added > least else "kept"
-    return Change(state, old.class_name, (old.id,), ids, length, now, now + (unseen if unseen > least else 0.0))
+    is_shorter = is_longer = False
+    counted = now
+    stretches = _open_stretches(old, pieces)
+    for number, stretch in enumerate(stretches):
+        beyond = (own.positions() > stretch.low) & (own.positions() < stretch.high)
+        vanished = own.metres(Sight.EMPTY, within=beyond)
+        unseen = own.metres(*Sight, within=beyond) - vanished
+        least = SIGMAS * float(np.linalg.norm(stretch.sigmas)) + STEP
+        is_shorter |= vanished > least
+        is_outer = number in (0, len(stretches) - 1)
+        is_longer |= is_outer and stretch.low - stretch.high > least
+        # Of a stretch that nobody has seen to be gone, the survey tells that knows the end better.
+        counted += unseen if unseen > SIGMAS * min(stretch.sigmas) + STEP else 0.0
+    state = "shorter" if is_shorter else "longer" if is_longer else "kept"
+    return Change(state, old.class_name, (old.id,), ids, length, now, counted)
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """From `low` to `high` [m] along a known axis nothing is measured now; `high` below `low` where the pipe has grown.
+
+    `sigmas`: of both limits [m].
+    """
+
+    low: float
+    high: float
+    sigmas: tuple[float, float]
+
+
+def _open_stretches(old: KnownPipe, pieces: Sequence[KnownPipe]) -> list[_Stretch]:
+    """What the pieces leave open of a pipe: before the first, between two, and after the last."""
+    spans = []
+    for piece in pieces:
+        along = old.cylinder.along(np.stack([piece.cylinder.start, piece.cylinder.end])).tolist()
+        spans.append(sorted(zip(along, piece.end_sigmas, strict=True)))
+    spans.sort()
+    lows = [(0.0, old.end_sigmas[0]), *(span[1] for span in spans)]
+    highs = [*(span[0] for span in spans), (old.cylinder.length, old.end_sigmas[1])]
+    return [_Stretch(low, high, (one, other)) for (low, one), (high, other) in zip(lows, highs, strict=True)]

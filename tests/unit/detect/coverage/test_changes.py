@@ -18,7 +18,7 @@ def views() -> list[View]:
 
 
 def known(name: str, cylinder: Cylinder, class_name: str = "DN") -> KnownPipe:
-    return KnownPipe(name, cylinder, class_name, 0.003)
+    return KnownPipe(name, cylinder, class_name, (0.002, 0.002))
 
 
 def by_pipe(told: list[Change]) -> dict[str, str]:
@@ -66,6 +66,21 @@ def test_a_pipe_in_pieces_is_one(views: list[View]) -> None:
     (told,) = changes([known("old", whole)], pieces, views)
     assert told.after == ("a", "b")
     assert told.state == "kept"
+
+
+@pytest.mark.parametrize(("grown", "state"), [(0.2, "longer"), (0.02, "kept")])
+def test_an_end_that_has_moved_tells_whatever_is_known_of_the_other(
+    views: list[View], grown: float, state: str
+) -> None:
+    """The foot of a pipe behind a box may be anywhere; its top is measured."""
+    old, now = upright(0.3).cut(0.0, 0.5), upright(0.3).cut(0.0, 0.5 + grown)
+    before = replace(known("old", old), end_sigmas=(0.7, 0.003))
+    for after in (
+        replace(known("a", now), end_sigmas=(0.1, 0.003)),
+        replace(known("a", Cylinder(now.end, now.start, now.radius)), end_sigmas=(0.003, 0.1)),
+    ):
+        (told,) = changes([before], [after], views)
+        assert told.state == state
 
 
 def test_the_part_that_is_hidden_now_counts_on(views: list[View]) -> None:
