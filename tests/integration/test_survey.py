@@ -29,6 +29,7 @@ from pipeprog_bringup.recording.bag import Bag
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import FrameDecision
 from pipeprog_node import messages, qos
+from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG, BOQ, BOARD = (BAGS / f"demo.{end}" for end in ("mcap", "boq.yaml", "board.yaml"))
@@ -179,3 +180,14 @@ def test_surveys_come_one_after_another(mission: Mission, surveys: Path) -> None
     assert second.status == GoalStatus.STATUS_CANCELED
     assert names(surveys / "second") >= {"frames.csv", "out.mcap", "run.json", "config.yaml"}
     assert json.loads((surveys / "second" / "run.json").read_text())["cancelled"]
+
+    handle = mission.send(survey_id="third", reference="first")
+    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].classes)
+    assert mission.call(mission.end, Trigger.Request()).success
+    third = mission.result(handle)
+    assert (third.status, third.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")
+    before, after = (read_map(surveys / name / MAP_FILE) for name in ("first", "third"))
+    assert (after.frame, after.aligned_by != "") == (before.frame, True)
+    assert third.result.reference_covariance.any()
+    lives = {pipe["life"] for pipe in json.loads((surveys / "third" / "pipes.json").read_text())["pipes"]}
+    assert lives & {pipe["id"] for pipe in written["pipes"]}

@@ -436,7 +436,7 @@ class SfmNode(Node):
 
 def main() -> None:
     """Entry point of sfm_node."""
-    run(SfmNode, renewed=("board", "colmap"))
+    run(SfmNode, renewed=("board", "colmap", "reference"))
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ MAX_WORDS = 100  # of a command; programs of this kind take ten arguments
 MAX_SECONDS = 86400.0  # s; a day, as a survey's own limit
 MOVE_SECONDS = 600.0  # s for a command that moves the robot; half a kilometre at a walk
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")  # leaves room in a survey's 64 characters for the patrol's name
-_SHARED = ("boq", "board", "go_to", "film", "seconds", "move_seconds")
-_PLACE = "{place}"  # stands for the name of the place in a command
+_SHARED = ("boq", "board", "reference", "go_to", "film", "seconds", "move_seconds")
+_PLACE = "{place}"  # stands for the name of the place in a command, and in the name of a reference
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Place:
         move_seconds: of either command at most.
         boq: file of the bill of quantities; empty: as the node survey has it.
         board: file of the boards; empty: as the node survey has it.
+        reference: survey in whose frame this one is to lie, as the node survey takes it; empty: none.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Place:
     move_seconds: float = MOVE_SECONDS
     boq: str = ""
     board: str = ""
+    reference: str = ""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ def _place(path: Path, where: str, entry: Any, shared: dict[str, Any]) -> Place:
         raise InputError(f"{where}: when does filming end? give `film`, a command that walks the robot, or `seconds`")
     move_seconds = _seconds(f"{where}: move_seconds", given.get("move_seconds", MOVE_SECONDS))
     boq, board = (_file(path, f"{where}: {key}", given.get(key)) for key in ("boq", "board"))
-    return Place(name, go_to, film, seconds, move_seconds or MOVE_SECONDS, boq, board)
+    reference = name_of(given["reference"], f"{where}: reference") if "reference" in given else ""
+    reference = reference.replace(_PLACE, name)
+    return Place(name, go_to, film, seconds, move_seconds or MOVE_SECONDS, boq, board, reference)
 
 
 def _command(where: str, words: Any) -> tuple[str, ...]:

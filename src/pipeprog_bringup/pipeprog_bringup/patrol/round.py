@@ -33,7 +33,7 @@ class Surveyed:
 class Surveyor(Protocol):
     """The action `survey`, as a round needs it; one survey at a time."""
 
-    def start(self, survey_id: str, boq: str, board: str, seconds: float) -> None:
+    def start(self, survey_id: str, boq: str, board: str, seconds: float, reference: str) -> None:
         """Begins to film, for `seconds` at most (0: no limit); raises InputError where the node does not take it."""
 
     def end(self) -> None:
@@ -107,7 +107,7 @@ class Round:
         of.folder = of.error = ""
         self._note(place, FILMING, "")
         try:
-            self._surveyor.start(of.survey_id, place.boq, place.board, place.seconds)
+            self._surveyor.start(of.survey_id, place.boq, place.board, place.seconds, place.reference)
         except InputError as error:
             of.error = str(error)
             return False

@@ -53,9 +53,12 @@ class SurveyClient:
         """Whether no survey runs."""
         return self._result is None or self._result.done()
 
-    def start(self, survey_id: str = "", boq: str = "", board: str = "", seconds: float = 0.0) -> None:
+    def start(
+        self, survey_id: str = "", boq: str = "", board: str = "", seconds: float = 0.0, reference: str = ""
+    ) -> None:
         """Begins a survey, fields as of its goal; raises InputError where the node does not accept it."""
-        goal = Survey.Goal(survey_id=survey_id, boq=boq, board=board, time_limit=messages.duration_msg(seconds))
+        files = {"boq": boq, "board": board, "reference": reference}
+        goal = Survey.Goal(survey_id=survey_id, time_limit=messages.duration_msg(seconds), **files)
         deadline = time.monotonic() + self._start_seconds
         while not self._accepted(goal):
             if time.monotonic() + PAUSE > deadline:

@@ -18,6 +18,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from pipeprog_bringup.playback.listener import LastMessages
 from pipeprog_bringup.results import result_files
+from pipeprog_bringup.survey.alignment_result import note_alignment
 from pipeprog_bringup.survey.goal import Goal
 from pipeprog_bringup.survey.missing_input import PATIENCE
 from pipeprog_bringup.survey.passage import Cancelled, Passage, SurveyFailure
@@ -109,6 +110,8 @@ class ConductedSurvey:
         result.folder = str(output.path.resolve())
         if survey is not None:
             result.pipes = survey.pipes
+            if self._goal.reference is not None:
+                note_alignment(result, output.path)
 
     async def _at_rest(self) -> None:
         """The nodes wait for the next survey; one that does not answer now is asked again when that begins."""
@@ -180,6 +183,8 @@ class ConductedSurvey:
             "boq": result_files.boq_entries(site.boq),
             "boards": [board.name for board in site.board_file.boards],
         }
+        if self._goal.reference is not None:
+            config["survey"] = {"reference": str(self._goal.reference.path.parent)}
         facts = {
             "command": "survey",
             "frames_considered": passage.log.considered,

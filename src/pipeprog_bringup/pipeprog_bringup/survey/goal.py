@@ -11,6 +11,8 @@ from pathlib import Path
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import shown
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
+from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
+from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")  # a folder's name on every file system, and no path
@@ -29,12 +31,21 @@ class Site:
 
 
 @dataclass(frozen=True)
+class Reference:
+    """An earlier survey in whose frame one is to lie: its map.npz, and what that holds."""
+
+    path: Path
+    map: SurveyMap
+
+
+@dataclass(frozen=True)
 class Goal:
     """A survey that can begin. `name`: of its folder; `time_limit` [s], 0: none."""
 
     name: str
     site: Site
     time_limit: float
+    reference: Reference | None = None
 
 
 def read_site(boq: str, board: str) -> Site:
@@ -53,17 +64,29 @@ def _check_name(name: str) -> str:
     return name
 
 
-def check_goal(survey_id: str, site: Site, reference: str, time_limit: float, now: int) -> Goal:
+def check_goal(survey_id: str, site: Site, time_limit: float, now: int) -> Goal:
     """A goal of these fields, given at the time `now` [ns]; raises InputError where one cannot be used."""
     name = _check_name(survey_id) or _name_from_time(now)
-    if reference:
-        raise InputError(
-            f"reference {shown(reference)}: a live survey is not aligned with an earlier one yet: leave it empty, and "
-            "replay its recording with --reference"
-        )
     if not 0.0 <= time_limit <= MAX_TIME:
         raise InputError(f"time_limit {time_limit:g} s: give 0 (none) to {MAX_TIME:g} s")
     return Goal(name, site, time_limit)
+
+
+def read_reference(text: str, results: Path) -> Reference:
+    """The survey that a goal names, by the name of its folder in `results` or by an absolute path.
+
+    Raises InputError where that is none, or holds no map.
+    """
+    folder = text.removeprefix("file://")
+    if "\0" in folder or len(folder) > _MAX_PATH or not (_NAME.fullmatch(folder) or folder.startswith("/")):
+        raise InputError(
+            f"reference {shown(text)}: name a survey's folder in {results}, or give the absolute path of one"
+        )
+    path = (results / folder / MAP_FILE).resolve()
+    try:
+        return Reference(path, read_map(path))
+    except InputError as error:
+        raise InputError(f"reference {shown(text)}: {error}") from None
 
 
 def _name_from_time(stamp: int) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -16,7 +17,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from pipeprog_bringup.survey.conducted_survey import ConductedSurvey
-from pipeprog_bringup.survey.goal import check_goal, read_site
+from pipeprog_bringup.survey.goal import check_goal, read_reference, read_site
 from pipeprog_bringup.survey.missing_input import missing_input
 from pipeprog_bringup.survey.robot_input import RobotInput
 from pipeprog_bringup.survey.survey_output import SurveyOutput
@@ -29,6 +30,7 @@ from pipeprog_node.parameters import declare_fixed
 
 TICK = 0.1  # s between two looks at what a survey waits for
 RESULT_TIMEOUT = 6 * 3600  # s that a result is kept for: a robot asks for it when it is home
+USABLE = {Survey.Result.NONE, Survey.Result.NOT_ALIGNED, Survey.Result.NO_SPACE}  # codes of surveys with pipes
 
 
 class SurveyNode(LifecycleNode):
@@ -107,7 +109,7 @@ class SurveyNode(LifecycleNode):
             self.get_logger().error(for_terminal(result.error_msg))
         if handle.is_cancel_requested:
             handle.canceled()
-        elif result.pipes.map_revision and result.error_code in (Survey.Result.NONE, Survey.Result.NO_SPACE):
+        elif result.pipes.map_revision and result.error_code in USABLE:
             handle.succeed()
         else:
             handle.abort()
@@ -118,7 +120,9 @@ class SurveyNode(LifecycleNode):
         try:
             site = read_site(request.boq or self._boq, request.board or self._board)
             limit = messages.seconds(request.time_limit)
-            goal = check_goal(request.survey_id, site, request.reference, limit, self.get_clock().now().nanoseconds)
+            goal = check_goal(request.survey_id, site, limit, self.get_clock().now().nanoseconds)
+            if request.reference:
+                goal = replace(goal, reference=read_reference(request.reference, self._results))
             output = SurveyOutput(self._results, goal, self._record)
         except InputError as error:
             return Survey.Result(error_code=Survey.Result.BAD_INPUT, error_msg=str(error))

@@ -77,7 +77,8 @@ class Passage:
         """
         board = str(goal.site.board_path.resolve()) if goal.site.board_path else ""
         await self._renewed("detect", boq=str(goal.site.boq_path.resolve()))
-        await self._renewed("sfm", board=board, colmap=str(colmap.resolve()))
+        reference = str(goal.reference.path) if goal.reference else ""
+        await self._renewed("sfm", board=board, colmap=str(colmap.resolve()), reference=reference)
         await self._renewed("frames", idle=False)
         await self._until(self._is_connected, DELIVERY_SECONDS, "the nodes have not found each other")
 

@@ -85,7 +85,8 @@ class SurveyOutput:
             record_survey(self._recording, survey, status)
             cameras = record_cameras(self._recording, survey, self._infos)
             seen = seen_by(survey, cameras, self._goal.site.boq.pipes)
-            write_survey(self._folder, survey, log, seen, with_cloud=True)
+            reference = self._goal.reference.map if self._goal.reference else None
+            write_survey(self._folder, survey, log, seen, with_cloud=True, reference=reference)
         else:
             result_files.write_frames(self._folder.file("frames.csv"), log.rows())
         if self._goal.site.boq.pipes:

@@ -21,15 +21,24 @@ def read(tmp_path: Path, text: str) -> Patrol:
 def test_a_place_has_what_it_says_and_what_all_say(tmp_path: Path) -> None:
     patrol = read(
         tmp_path,
-        "boq: site.yaml\ngo_to: [walk, '{place}']\nhome: [walk, dock]\nplaces:\n"
+        "boq: site.yaml\nreference: 'first_{place}'\ngo_to: [walk, '{place}']\nhome: [walk, dock]\nplaces:\n"
         "- {name: level1, film: [walk, '{place}_end'], board: /boards/a.yaml}\n"
         "- {name: level2, seconds: 30, go_to: [fly]}\n",
     )
     boq = str(tmp_path / "site.yaml")
     assert patrol.home == ("walk", "dock")
     assert patrol.places == (
-        Place("level1", ("walk", "level1"), ("walk", "level1_end"), 0.0, MOVE_SECONDS, boq, "/boards/a.yaml"),
-        Place("level2", ("fly",), (), 30.0, MOVE_SECONDS, boq, ""),
+        Place(
+            "level1",
+            ("walk", "level1"),
+            ("walk", "level1_end"),
+            0.0,
+            MOVE_SECONDS,
+            boq,
+            "/boards/a.yaml",
+            "first_level1",
+        ),
+        Place("level2", ("fly",), (), 30.0, MOVE_SECONDS, boq, "", "first_level2"),
     )
 
 
@@ -48,6 +57,7 @@ def test_a_place_has_what_it_says_and_what_all_say(tmp_path: Path) -> None:
         ("places:\n- {name: a, seconds: -1}", ["seconds", "-1"]),
         ("places:\n- {name: a, secnds: 1}", ["secnds", "seconds"]),
         ("places:\n- {name: a, seconds: 1, boq: [x]}", ["boq", "name"]),
+        ("places:\n- {name: a, seconds: 1, reference: [x]}", ["reference", "name"]),
         ("plces:\n- {name: a, seconds: 1}", ["plces", "places"]),
     ],
 )

@@ -31,7 +31,7 @@ class Notes:
     def is_over(self) -> bool:
         return not self._name
 
-    def start(self, survey_id: str, boq: str, board: str, seconds: float) -> None:
+    def start(self, survey_id: str, boq: str, board: str, seconds: float, reference: str) -> None:
         if self.refused:
             self.refused -= 1
             raise InputError("no goal accepted")

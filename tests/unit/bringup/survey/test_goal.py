@@ -4,21 +4,42 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeprog_bringup.survey.goal import MAX_TIME, Site, check_goal, read_site
+from pipeprog_bringup.survey.alignment_result import note_alignment
+from pipeprog_bringup.survey.goal import MAX_TIME, Site, check_goal, read_reference, read_site
 from pipeprog_bringup.survey.survey_output import SurveyOutput
+from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import for_terminal
+from pipeprog_msgs.action import Survey
+from pipeprog_msgs.msg import SfmStatus
+from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
+from pipeprog_sfm.alignment.survey_map import SurveyMap
 
 BAGS = Path(__file__).parents[4] / "bags"
 BOQ, BOARD = BAGS / "demo.boq.yaml", BAGS / "demo.board.yaml"
 NOW = 1_700_000_000_000_000_000  # ns, 2023-11-14 22:13:20 UTC
+MAP = SurveyMap(  # of one keyframe with one point
+    frame="night1",
+    aligned_by="",
+    scale_sigma=1e-4,
+    stamps=np.array([NOW]),
+    cameras=(Camera(480, 270, 340.0, 340.0, 239.5, 134.5),),
+    map_from_camera=np.eye(4)[None],
+    offsets=np.array([0, 1]),
+    pixels=np.zeros((1, 2), np.float32),
+    descriptors=np.zeros((1, 128), np.uint8),
+    point_of=np.array([0]),
+    points=np.array([[0.0, 0.0, 2.0]]),
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,32 +52,60 @@ def site() -> Site:
 )
 def test_a_name_that_is_no_plain_folder_is_refused(site: Site, name: str) -> None:
     with pytest.raises(InputError, match="survey_id"):
-        check_goal(name, site, "", 0.0, NOW)
+        check_goal(name, site, 0.0, NOW)
 
 
 @given(st.text(max_size=80))
 def test_what_is_accepted_lies_in_the_folder_of_results(text: str) -> None:
     site = read_site(str(BOQ), "")
     try:
-        goal = check_goal(text, site, "", 0.0, NOW)
+        goal = check_goal(text, site, 0.0, NOW)
     except InputError:
         return
     assert (Path("/results") / goal.name).resolve().parent == Path("/results")
 
 
 def test_a_survey_without_a_name_is_named_by_the_time(site: Site) -> None:
-    assert check_goal("", site, "", 60.0, NOW).name == "survey_20231114T221320Z"
+    assert check_goal("", site, 60.0, NOW).name == "survey_20231114T221320Z"
 
 
 @pytest.mark.parametrize("limit", [-1.0, MAX_TIME + 1, float("nan"), float("inf")])
 def test_a_time_limit_that_is_none_is_refused(site: Site, limit: float) -> None:
     with pytest.raises(InputError, match="time_limit"):
-        check_goal("a", site, "", limit, NOW)
+        check_goal("a", site, limit, NOW)
 
 
-def test_a_reference_is_refused_until_surveys_can_be_aligned(site: Site) -> None:
+def test_a_reference_is_a_folder_of_the_results_or_an_absolute_one(tmp_path: Path) -> None:
+    (tmp_path / "monday").mkdir()
+    write_map(tmp_path / "monday" / MAP_FILE, MAP)
+    for text in ("monday", str(tmp_path / "monday"), f"file://{tmp_path}/monday"):
+        reference = read_reference(text, tmp_path)
+        assert (reference.path, reference.map.frame) == (tmp_path / "monday" / MAP_FILE, MAP.frame)
+
+
+@pytest.mark.parametrize("text", ["tuesday", "../monday", "s3://monday", "./monday", "/nowhere", "a\0b", "/" * 5000])
+def test_a_reference_that_holds_no_map_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "tuesday").mkdir()
     with pytest.raises(InputError, match="reference"):
-        check_goal("a", site, "last_week", 0.0, NOW)
+        read_reference(text, tmp_path / "surveys")
+
+
+@pytest.mark.parametrize(("aligned_by", "code"), [("places", Survey.Result.NONE), ("", Survey.Result.NOT_ALIGNED)])
+def test_the_result_says_how_well_a_survey_is_aligned(tmp_path: Path, aligned_by: str, code: int) -> None:
+    covariance = np.diag([4e-6] * 3 + [1e-8] * 3 + [1e-9]) if aligned_by else np.zeros((7, 7))
+    write_map(tmp_path / MAP_FILE, replace(MAP, aligned_by=aligned_by, alignment_covariance=covariance))
+    result = Survey.Result(sfm=SfmStatus(message="no place was found again"))
+    note_alignment(result, tmp_path)
+    assert result.error_code == code
+    assert result.error_msg == ("" if aligned_by else "no place was found again")
+    assert np.allclose(result.reference_covariance.reshape(6, 6), covariance[:6, :6], rtol=0.0, atol=0.0)
+
+
+def test_a_survey_that_ended_before_its_last_map_is_not_aligned(tmp_path: Path) -> None:
+    result = Survey.Result()
+    note_alignment(result, tmp_path)
+    assert result.error_code == Survey.Result.NOT_ALIGNED
+    assert "ended before" in result.error_msg
 
 
 ABSURD_NAMES = [
@@ -90,7 +139,9 @@ def absurd_goal(rng: random.Random) -> dict[str, Any]:
 def begin(goal: dict[str, Any], results: Path) -> SurveyOutput:
     """What the node does with a goal: its files, its fields, its folder."""
     site = read_site(goal["boq"], goal["board"])
-    checked = check_goal(goal["survey_id"], site, goal["reference"], goal["time_limit"], NOW)
+    checked = check_goal(goal["survey_id"], site, goal["time_limit"], NOW)
+    if goal["reference"]:
+        checked = replace(checked, reference=read_reference(goal["reference"], results))
     return SurveyOutput(results, checked, record=False)
 
 

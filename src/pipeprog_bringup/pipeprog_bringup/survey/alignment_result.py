@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the result of the action says of the frame of a survey that was to lie in that of an earlier one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeprog_msgs.action import Survey
+from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
+
+_BEFORE_ALIGNMENT = "not aligned with the reference, so the pipes are in a frame of their own: only the last map of a "
+_BEFORE_ALIGNMENT += "survey is aligned, and this one was ended before"
+
+
+def note_alignment(result: Survey.Result, folder: Path) -> None:
+    """Notes how well the survey lies in the frame of its reference, or NOT_ALIGNED and why.
+
+    `folder`: of a survey with pipes; it has a map.npz where the last map was made.
+    """
+    path = folder / MAP_FILE
+    survey = read_map(path) if path.is_file() else None
+    if survey is not None and survey.aligned_by:
+        result.reference_covariance = survey.alignment_covariance[:6, :6].ravel()
+        return
+    reason = _BEFORE_ALIGNMENT if survey is None else result.sfm.message
+    result.error_code = Survey.Result.NOT_ALIGNED
+    result.error_msg = "; ".join(filter(None, (reason, result.error_msg)))
