@@ -54,7 +54,7 @@ The first run in it compiles for some minutes.
 | room there | a replay holds its recording's images there, and says before it begins where they do not fit |
 | room for the results | said before the work begins; what the folder held stays |
 
-Nodes on a robot keep the journal of their keyframes among the temporary files, and their logs in `ROS_LOG_DIR` or `ROS_HOME`.
+Nodes on a robot keep the journal of their keyframes among the temporary files, in a survey of the action in its folder, and their logs in `ROS_LOG_DIR` or `ROS_HOME`.
 """  # noqa: E501
 
 OPEN = (

@@ -120,32 +120,54 @@ def mission() -> Iterator[Mission]:
     rclpy.shutdown()
 
 
+class Nodes:
+    """A graph that runs; `folder` is that of its surveys."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._commands: dict[str, list[str]] = {}
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, command: list[str]) -> None:
+        self._commands[name] = command
+        self._processes[name] = subprocess.Popen(command)
+
+    def kill_and_start_again(self, name: str) -> None:
+        """As a launch file does with what dies."""
+        self._processes[name].kill()
+        self._processes[name].wait()
+        self.start(name, self._commands[name])
+
+    def close(self) -> None:
+        for process in self._processes.values():
+            process.kill()
+            process.wait()
+
+
 @pytest.fixture
-def surveys(tmp_path: Path) -> Iterator[Path]:
-    """The folder of the surveys of a graph that runs."""
+def nodes(tmp_path: Path) -> Iterator[Nodes]:
     parameters: dict[str, dict[str, Any]] = {
         "frames": {"idle": True},
         "sfm": {"map_interval": 4, **COARSE},
         "detect": {"boq": str(BOQ)},
         "survey": {"boq": str(BOQ), "board": str(BOARD), "results": str(tmp_path / "surveys")},
     }
-    started = []
+    nodes = Nodes(tmp_path / "surveys")
     for name, module in MODULES.items():
         file = tmp_path / f"{name}.yaml"
         file.write_text(yaml.safe_dump({name: {"ros__parameters": parameters[name]}}))
         command = [sys.executable, "-m", module, "--ros-args", "-r", f"__node:={name}", "--params-file", str(file)]
-        started.append(subprocess.Popen(command))
-    yield tmp_path / "surveys"
-    for process in started:
-        process.kill()
-        process.wait()
+        nodes.start(name, command)
+    yield nodes
+    nodes.close()
 
 
 def names(folder: Path) -> set[str]:
     return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
 
 
-def test_surveys_come_one_after_another(mission: Mission, surveys: Path) -> None:
+def test_surveys_come_one_after_another(mission: Mission, nodes: Nodes) -> None:
+    surveys = nodes.folder
     mission.wait_for(mission.client.server_is_ready)
     assert not mission.send().accepted  # not configured yet
     assert mission.change(Transition.TRANSITION_CONFIGURE)
@@ -182,7 +204,11 @@ def test_surveys_come_one_after_another(mission: Mission, surveys: Path) -> None
     assert json.loads((surveys / "second" / "run.json").read_text())["cancelled"]
 
     handle = mission.send(survey_id="third", reference="first")
-    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].classes)
+    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].registered > 2)
+    registered = mission.feedback[-1].registered
+    nodes.kill_and_start_again("sfm")
+    mission.wait_for(lambda: mission.feedback[-1].registered > registered)  # it has taken the survey up
+    mission.wait_for(lambda: mission.feedback[-1].classes)
     assert mission.call(mission.end, Trigger.Request()).success
     third = mission.result(handle)
     assert (third.status, third.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")

@@ -47,6 +47,7 @@ from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
+from pipeprog_node.journal import journal_of
 from pipeprog_node.keyframe_input import IMAGES, REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
@@ -191,7 +192,7 @@ class DetectNode(Node):
 
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("detect", parameter_overrides=list(overrides))
-        config = declare(self, DetectConfig, extra=("boq", "intermediate"))
+        config = declare(self, DetectConfig, extra=("boq", "intermediate", "journal"))
         path = declare_fixed(self, "boq", "", "file of the bill of quantities")
         if not path:
             raise InputError("no bill of quantities: set the parameter boq to its file")
@@ -204,10 +205,17 @@ class DetectNode(Node):
         self._waited: dict[int, int] = {}  # ticks, by stamp of the keyframes that the newest map waits for
         self._in_work: ReceivedStatus | None = None  # of the map that the worker has
         self._revision = self._pipes = 0
-        self._supervision = Supervision(self._start_worker, "the detection process")
+        journal = journal_of(declare_fixed(self, "journal", "", "folder for the journal of a survey"), "detect")
+        if journal is not None:
+            self._named |= journal.note or {}
+            self._numbers |= {keyframe.stamp: number for number, keyframe in journal.commands()}
+        self._supervision = Supervision(self._start_worker, "the detection process", journal=journal)
         self._output = PipeOutput(self, boq)
         self._intake = Intake(self)
-        self._keyframes = KeyframeInput(self._intake, self._on_keyframe, lambda stamp: self._leave_out([stamp]))
+        known = None if journal is None else self._numbers
+        self._keyframes = KeyframeInput(
+            self._intake, self._on_keyframe, lambda stamp: self._leave_out([stamp]), known=known
+        )
         self._maps = MapInput(self._intake, self._hand_over)
         self._finish = FinishService(self, lambda: self._maps.revision, self._on_finish)
         self._diagnostics = Diagnostics(self, "pipes", self._health)
@@ -312,6 +320,7 @@ class DetectNode(Node):
         assert self._in_work is not None
         product = event.product
         self._named |= {pipe.id: pipe.cylinder for pipe in product.pipes}
+        self._supervision.note(self._named)
         self._revision, self._pipes = event.revision, len(product.pipes)
         self._output.publish(product, self._in_work)
         self._answer_when_published()
@@ -424,7 +433,7 @@ def _progress_msg(row: ClassProgress, product: Product, boq: BillOfQuantities) -
 
 def main() -> None:
     """Entry point of detect_node."""
-    run(DetectNode, renewed=("boq",))
+    run(DetectNode, renewed=("boq", "journal"))
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.discovery import stages_subscribed
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake
+from pipeprog_node.journal import Journal, journal_of
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
 from pipeprog_node.received import images as received_images
@@ -40,6 +41,7 @@ from pipeprog_node.received import keyframes as received_keyframes
 
 ArrivedCalibration = tuple[str, int, Camera | None]  # name of its camera, stamp [ns], None where it cannot be used
 STAGES = 2  # nodes of the graph that take keyframes: SfM and detector
+KEPT = 50  # keyframes for a node that is started anew: a minute of them, of which it is away for seconds
 
 
 class KeyframePublisher:
@@ -48,9 +50,9 @@ class KeyframePublisher:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._decisions = node.create_publisher(FrameDecision, "frame_decisions", qos.reliable(1000))
-        self._images = node.create_publisher(CompressedImage, "keyframes/image/compressed", qos.reliable(50))
-        self._infos = node.create_publisher(CameraInfo, "keyframes/camera_info", qos.reliable(50))
-        self._retired = node.create_publisher(KeyframesRetired, "keyframes/retired", qos.reliable(50))
+        self._images = node.create_publisher(CompressedImage, "keyframes/image/compressed", qos.kept(KEPT))
+        self._infos = node.create_publisher(CameraInfo, "keyframes/camera_info", qos.kept(KEPT))
+        self._retired = node.create_publisher(KeyframesRetired, "keyframes/retired", qos.kept(KEPT))
 
     @property
     def is_connected(self) -> bool:
@@ -91,7 +93,7 @@ class KeyframePublisher:
 
 
 class FrameInput:
-    """The topics of the camera and of the SfM's answers.
+    """The topics of the camera.
 
     Every image is handed on, one that is refused with the reason: each has its decision, which is what a replay counts.
     A calibration that is refused is handed on as None.
@@ -103,12 +105,10 @@ class FrameInput:
         config: FramesConfig,
         on_image: Callable[[Arrival], None],
         on_calibration: Callable[[ArrivedCalibration], None],
-        on_answer: Callable[[Answer], None],
         cameras: Sequence[str],
     ) -> None:
         """`cameras`: names of those whose topics are subscribed; see `_subscribe`."""
         self.intake = Intake(node)
-        self._overlaps = self.intake.subscribe(ImageOverlapArray, "image_overlap", _answer, on_answer, qos.reliable(50))
         if config.lockstep and len(cameras) > 1:
             # Topics are not ordered among each other: a player sends all cameras on one, and their frames tell them.
             self._subscribe(config, "", None, on_image, on_calibration, MAX_QUEUE * len(cameras))
@@ -139,11 +139,6 @@ class FrameInput:
         if config.image_transport != "compressed":
             subscribe(Image, raw, partial(self._arrival, raw, camera), on_image)
 
-    @property
-    def is_connected(self) -> bool:
-        """Whether an SfM answers."""
-        return self._overlaps.get_publisher_count() > 0
-
     def _calibration(self, topic: str, camera: tuple[str, int] | None, message: CameraInfo) -> ArrivedCalibration:
         name, number = camera or (message.header.frame_id[:MAX_NAME], 0)
         try:
@@ -170,7 +165,7 @@ class FramesNode(Node):
 
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("frames", parameter_overrides=list(overrides))
-        self._config = declare(self, FramesConfig, extra=("idle", "cameras"))
+        self._config = declare(self, FramesConfig, extra=("idle", "cameras", "journal"))
         idle = declare_fixed(self, "idle", False, "take no images, until a survey begins")
         if self._config.policy == "network" and not self._config.lockstep:
             raise InputError("policy = network takes a whole recording: use it with `pipeprog replay`, live use stream")
@@ -185,18 +180,46 @@ class FramesNode(Node):
         self._frame_id = ""  # of the camera, as its last image says
 
         self._publisher = KeyframePublisher(self)
+        self._journal = journal_of(declare_fixed(self, "journal", "", "folder for the journal of a survey"), "frames")
+        if self._journal is not None:
+            self._take_up(self._journal)
         self._input = FrameInput(
             self,
             self._config,
             self._on_image,
             self._on_calibration,
-            self._on_answer,
             () if idle else self._selection.names,
         )
+        # A process before this one may have taken answers that count.
+        profile = qos.reliable(50) if self._journal is None else qos.kept(50)
+        subscribe = self._input.intake.subscribe
+        self._overlaps = subscribe(ImageOverlapArray, "image_overlap", _answer, self._on_answer, profile)
         if self._config.lockstep:
             self._connecting = self.create_timer(0.1, self._start_when_connected)
         self._finish = FinishService(self, lambda: self._considered + len(self._queue), self._on_finish)
         self._diagnostics = Diagnostics(self, "keyframes", self._health)
+
+    def destroy_node(self) -> None:
+        """Closes the journal with the node."""
+        if self._journal is not None:
+            self._journal.close()
+        super().destroy_node()
+
+    def _take_up(self, journal: Journal) -> None:
+        """Counts what is in the journal as published, and publishes the last of it again: it may not have arrived."""
+        for number, change in journal.commands():
+            self._publish(change, again=number >= journal.end - KEPT)
+
+    def _publish(self, change: EncodedFrame | list[int], again: bool = True) -> None:
+        """Publishes a keyframe or a retirement; without `again` it is counted only."""
+        if isinstance(change, EncodedFrame):
+            self._ledger.publish(change.stamp)
+            if again:
+                self._publisher.publish(change)
+            return
+        self._ledger.retire()
+        if again:
+            self._publisher.retire(change, self._ledger.published, self._frame_id)
 
     def _on_calibration(self, calibration: ArrivedCalibration) -> None:
         self._selection.calibrate(*calibration)
@@ -225,7 +248,7 @@ class FramesNode(Node):
             self._drain()
 
     def _is_connected(self) -> bool:
-        return self._publisher.is_connected and self._input.is_connected
+        return self._publisher.is_connected and self._overlaps.get_publisher_count() > 0
 
     def _on_answer(self, answer: Answer) -> None:
         try:
@@ -313,13 +336,16 @@ class FramesNode(Node):
                     return False
                 self._apply_reports(published + 1 - MAX_AHEAD)
             change = self._changes.popleft()
-            if isinstance(change, EncodedFrame):
-                self._ledger.publish(change.stamp)
-                self._publisher.publish(change)
-            else:
-                self._ledger.retire()
-                self._publisher.retire(change, self._ledger.published, self._frame_id)
+            if self._journal is not None:
+                self._write_down(self._journal, change)
+            self._publish(change)
         return True
+
+    def _write_down(self, journal: Journal, change: EncodedFrame | list[int]) -> None:
+        try:
+            journal.write(journal.end, change)
+        except OSError as error:
+            self.get_logger().error(f"not in the journal of the survey: {error.strerror}", throttle_duration_sec=10.0)
 
     def _apply_reports(self, keyframes: int) -> None:
         """Uses the answers to the first `keyframes` keyframes; later ones wait, so that a replay repeats itself."""
@@ -373,7 +399,7 @@ def _answer(message: ImageOverlapArray) -> Answer:
 
 def main() -> None:
     """Entry point of frames_node."""
-    run(FramesNode, renewed=("idle",))
+    run(FramesNode, renewed=("idle", "journal"))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from sensor_msgs.msg import CameraInfo, CompressedImage
@@ -32,6 +32,8 @@ class KeyframeInput:
         intake: the door of the node.
         use: gets stamp [ns], encoded image, camera and frame of each keyframe.
         lose: gets the stamp of one that will not come, as a part of it was dropped; for nodes that wait for it.
+        known: where a journal is kept: stamps of the keyframes in it, which may come again and are passed over; what
+            was published while nobody was there is asked for, too.
     """
 
     def __init__(
@@ -39,13 +41,16 @@ class KeyframeInput:
         intake: Intake,
         use: Callable[[int, bytes, Camera, str], None],
         lose: Callable[[int], None] = lambda stamp: None,
+        known: Collection[int] | None = None,
     ) -> None:
         self._intake, self._use, self._lose = intake, use, lose
+        self._known = frozenset(known or ())
+        self._comes_again = known is not None
         self._images: dict[_Key, bytes] = {}  # without calibration
         self._cameras: dict[_Key, Camera] = {}  # without image
         self._stamps: dict[_Key, int] = {}  # of the keyframes handed on: theirs alone
         self._keys: dict[int, _Key] = {}  # the reverse
-        depth = qos.reliable(DEPTH)
+        depth = qos.reliable(DEPTH) if known is None else qos.kept(DEPTH)
         intake.subscribe(
             CompressedImage, IMAGES, received_images.compressed_image, self._on_image, depth, dropped=self._on_dropped
         )
@@ -81,6 +86,8 @@ class KeyframeInput:
         self._lose(messages.stamp_ns(message.header.stamp))
 
     def _is_new(self, key: _Key, topic: str) -> bool:
+        if key[0] in self._known or (self._comes_again and key in self._stamps):
+            return False
         if key in self._stamps:
             text = f"the keyframe of camera {key[1]!r} at {key[0]} ns came twice: is it published by two nodes?"
             self._intake.reject(topic, InvalidMessageError("repeated", text))

@@ -14,6 +14,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 from pipeprog_node.journal import Journal, Record
@@ -68,6 +69,8 @@ class Supervision:
             it says when it is ready.
         name: of the worker in reports: "the reconstruction".
         clock: seconds.
+        journal: of the commands; None: one that is gone with this process. What is in it already is taken up: the
+            first worker gets it.
 
     Attributes:
         in_work: number of the command that the worker says it works on; None: the oldest without an answer.
@@ -76,12 +79,16 @@ class Supervision:
     """
 
     def __init__(
-        self, start: Callable[[Record], Worker], name: str, clock: Callable[[], float] = time.monotonic
+        self,
+        start: Callable[[Record], Worker],
+        name: str,
+        clock: Callable[[], float] = time.monotonic,
+        journal: Journal | None = None,
     ) -> None:
         self._start, self._name, self._clock = start, name, clock
-        self._journal = Journal()
-        self._commands = 0  # given so far: the next number
-        self._unanswered: dict[int, Command] = {}
+        self._journal = Journal() if journal is None else journal
+        self._commands = self._journal.end  # given so far: the next number
+        self._unanswered: dict[int, Command] = {number: self._journal.read(number) for number in self._journal.waiting}
         self._request: tuple[int, Command] | None = None
         self._deaths_of: Counter[int] = Counter()
         self._poisons: set[bytes] = set()
@@ -90,7 +97,8 @@ class Supervision:
         self._rest_ends: float | None = None
         self.in_work: int | None = None
         self._ready = False
-        self._worker: Worker | None = start(self._journal.record(0))
+        self._worker: Worker | None = None
+        self._begin()
 
     @property
     def is_ready(self) -> bool:
@@ -133,19 +141,15 @@ class Supervision:
 
     def keep(self, command: Command) -> int:
         """Gives a command that has no answer; returns its number."""
-        number = self._commands
-        self._commands += 1
-        try:
-            self._journal.write(number, command)
-        except OSError:  # no room: a worker that dies then loses it, and this one goes on
-            self._unsaved += 1
-        if self._worker is not None:
-            self._worker.send(command)
-        return number
+        return self._give(command, waits=False)
 
     def send(self, command: Command) -> None:
         """Gives a command that is answered, after those before it."""
-        self._unanswered[self.keep(command)] = command
+        self._unanswered[self._give(command, waits=True)] = command
+
+    def note(self, content: Any) -> None:
+        """Notes in the journal what its reader is to know besides the commands."""
+        self._save(partial(self._journal.write_note, content))
 
     def request(self, command: Command) -> None:
         """Asks for a result of all commands before this one."""
@@ -160,7 +164,9 @@ class Supervision:
 
     def answered(self) -> None:
         """The oldest command that was sent is answered."""
-        del self._unanswered[next(iter(self._unanswered))]
+        number = next(iter(self._unanswered))
+        del self._unanswered[number]
+        self._save(partial(self._journal.answered, number))
         self._vain_deaths = 0
 
     def fulfilled(self) -> None:
@@ -201,6 +207,20 @@ class Supervision:
         self._leave()
         self._journal.close()
 
+    def _give(self, command: Command, waits: bool) -> int:
+        number = self._commands
+        self._commands += 1
+        self._save(partial(self._journal.write, number, command, waits))
+        if self._worker is not None:
+            self._worker.send(command)
+        return number
+
+    def _save(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except OSError:  # no room: a worker that dies then loses it, and this one goes on
+            self._unsaved += 1
+
     def _blame(self) -> tuple[Command | None, Command | None]:
         """Drops the command in work where a worker has died of it before; returns it, and as request that fails."""
         number = self._suspect()
@@ -215,7 +235,7 @@ class Supervision:
             self._remember(command)
             return command, command
         command = self._unanswered.pop(number) if number in self._unanswered else self._journal.read(number)
-        self._journal.remove(number)
+        self._save(partial(self._journal.remove, number))
         self._remember(command)
         return command, None
 

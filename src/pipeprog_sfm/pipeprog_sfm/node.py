@@ -34,6 +34,7 @@ from pipeprog_node.camera_transforms import FRAME, CameraTransforms
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
+from pipeprog_node.journal import Journal, journal_of
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
@@ -155,6 +156,7 @@ class MapOutput:
     Attributes:
         revision: maps published.
         frame: where the map's origin is, in words; empty before the first map.
+        newest_stamp: of the poses published last [ns].
         correction: distance [m] by which the last map moved the keyframe that it moved most.
     """
 
@@ -164,7 +166,7 @@ class MapOutput:
         self.correction = 0.0
         self._node = node
         self._logger = node.get_logger()
-        self._map_stamp = self._pose_stamp = 0
+        self._map_stamp = self.newest_stamp = 0
         self._map_trajectory: Trajectory | None = None
         self._overlap = node.create_publisher(msg.ImageOverlapArray, "image_overlap", qos.kept(50))
         self._points = node.create_publisher(PointCloud2, "map_points", qos.latched())
@@ -199,8 +201,8 @@ class MapOutput:
     def publish_poses(self, trajectory: Trajectory) -> Header:
         """Poses in `map`; returns the header under which they were published."""
         # Stamps of two publications differ by a nanosecond at least, so that cloud and poses of a map can be paired.
-        self._pose_stamp = max(int(trajectory.stamps[-1]), self._pose_stamp + 1)
-        header = messages.header(self._pose_stamp, "map")
+        self.newest_stamp = max(int(trajectory.stamps[-1]), self.newest_stamp + 1)
+        header = messages.header(self.newest_stamp, "map")
         if trajectory.velocities is not None:
             if self._velocities is None:
                 self._velocities = self._node.create_publisher(
@@ -215,7 +217,7 @@ class MapOutput:
         """Poses and cloud of a new map, and the camera where it was refined, all under the same stamp."""
         self.revision += 1
         header = self.publish_poses(metric_map.trajectory)
-        self._map_stamp = self._pose_stamp
+        self._map_stamp = self.newest_stamp
         self._camera_refined = metric_map.refined_camera is not None
         if metric_map.refined_camera is not None:
             self._cameras.publish(messages.info_from_camera(metric_map.refined_camera, self._map_stamp, camera_frame))
@@ -263,7 +265,7 @@ class SfmNode(Node):
 
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("sfm", parameter_overrides=list(overrides))
-        extra = ("board", "colmap", "lockstep", "intermediate", "publish_tf", "reference")
+        extra = ("board", "colmap", "lockstep", "intermediate", "publish_tf", "reference", "journal")
         config = declare(self, SfmConfig, extra=extra)
         board = declare_fixed(self, "board", "", "file of the boards on site")
         intermediate = declare_fixed(
@@ -276,12 +278,12 @@ class SfmNode(Node):
         self._lockstep = declare_fixed(self, "lockstep", False, "every message counts, as in a replay")
         publish_tf = declare_fixed(self, "publish_tf", False, "publish map -> camera of the keyframes on /tf")
         self._transforms = CameraTransforms(self) if publish_tf else None
-        self._supervision = Supervision(self._start_worker, "the reconstruction process")
+        journal = journal_of(declare_fixed(self, "journal", "", "folder for the journal of a survey"), "sfm")
+        self._supervision = Supervision(self._start_worker, "the reconstruction process", journal=journal)
         self._done = self._dropped = self._retired = 0  # keyframes answered, keyframes left out, Retires answered
         self._output = MapOutput(self)
         self._intake = Intake(self)
         self._motion = MotionInput(self._intake, self._lockstep, ignored=FRAME if publish_tf else None)
-        self._keyframes = KeyframeInput(self._intake, self._on_keyframe)
         self._status = Status()
         self._motion_published = 0  # messages of motion that the last status counts
         self._retirements: list[ReceivedRetirement] = []  # to be applied after the keyframes before them
@@ -289,7 +291,11 @@ class SfmNode(Node):
         self._seen = self._last_stamp = 0
         self._camera_frame = ""  # of the newest keyframe
         self._finish_sent = False
-        depth = qos.reliable(MAX_BACKLOG)
+        # With a journal, what was published may come again.
+        self._known_retirements: set[tuple[int, ...]] | None = None if journal is None else set()
+        known = None if journal is None else self._take_up(journal)
+        self._keyframes = KeyframeInput(self._intake, self._on_keyframe, known=known)
+        depth = qos.reliable(MAX_BACKLOG) if journal is None else qos.kept(MAX_BACKLOG)
         self._intake.subscribe(msg.KeyframesRetired, RETIRED, received_keyframes.retirement, self._on_retired, depth)
         self._finish = FinishService(self, lambda: self._seen, self._begin_finish)
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
@@ -303,6 +309,30 @@ class SfmNode(Node):
         self._supervision.close()
         super().destroy_node()
 
+    def _take_up(self, journal: Journal) -> list[int]:
+        """Counts what is in the journal as it was counted before; returns the stamps of the keyframes in it."""
+        known, retired = [], []
+        for number, command in journal.commands():
+            is_answered = number not in journal.waiting
+            if isinstance(command, AddKeyframe):
+                known.append(command.stamp)
+                self._done += is_answered
+                self._camera_frame = command.frame
+                continue
+            retired.append(command.stamps)
+            self._retired += is_answered
+            if not is_answered:
+                self._retiring.append(ReceivedRetirement(max(command.stamps), self._camera_frame, 0, command.stamps))
+        self._known_retirements = set(retired)
+        if journal.note is not None:
+            self._dropped, self._output.revision, self._output.newest_stamp = journal.note
+        self._seen, self._last_stamp = len(known) + self._dropped, max(known, default=0)
+        return known
+
+    def _note(self) -> None:
+        """Keeps what the commands do not tell for a process that takes this one's place."""
+        self._supervision.note((self._dropped, self._output.revision, self._output.newest_stamp))
+
     def _on_keyframe(self, stamp: int, encoded: bytes, camera: Camera, frame_id: str) -> None:
         self._seen += 1
         self._last_stamp = max(self._last_stamp, stamp)
@@ -312,12 +342,17 @@ class SfmNode(Node):
             self._leave_out(keyframe)
         elif self._supervision.backlog >= MAX_BACKLOG:
             self._dropped += 1
+            self._note()
         else:
             self._supervision.send(replace(keyframe, motion=self._motion.take()))
         self._retire_when_due()
         self._finish_when_complete()
 
     def _on_retired(self, retirement: ReceivedRetirement) -> None:
+        if self._known_retirements is not None:
+            if retirement.stamps in self._known_retirements:
+                return
+            self._known_retirements.add(retirement.stamps)
         self._retirements.append(retirement)
         self._retire_when_due()
         if len(self._retirements) > MAX_BACKLOG:
@@ -350,6 +385,9 @@ class SfmNode(Node):
     def _on_event(self, event: Event) -> None:
         if isinstance(event, Ready):
             self._supervision.ready()
+            # Answers may have been lost with a process before this one.
+            if self._known_retirements is not None and self._done:
+                self._publish_overlap((), messages.header(self._last_stamp, self._camera_frame))
             return
         self._status = event.status
         if isinstance(event, KeyframeDone):
@@ -364,6 +402,7 @@ class SfmNode(Node):
             self._end_retirement(event.overlaps)
         elif isinstance(event, MapReady):
             self._output.publish_map(event.map, self._camera_frame)
+            self._note()
             self._publish_transform(event.map.trajectory)
         self._publish_status()
         if isinstance(event, Finished):
@@ -390,6 +429,7 @@ class SfmNode(Node):
     def _leave_out(self, keyframe: AddKeyframe) -> None:
         """Counts a keyframe of which the reconstruction dies as answered, so that nobody waits for it."""
         self._dropped += 1
+        self._note()
         self._publish_overlap((), messages.header(keyframe.stamp, keyframe.frame))
 
     def _end_retirement(self, reports: Sequence[OverlapReport]) -> None:
@@ -436,7 +476,7 @@ class SfmNode(Node):
 
 def main() -> None:
     """Entry point of sfm_node."""
-    run(SfmNode, renewed=("board", "colmap", "reference"))
+    run(SfmNode, renewed=("board", "colmap", "reference", "journal"))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,10 +21,12 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_frames.node import FramesNode
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame
+from pipeprog_frames.node import KEPT, FramesNode
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
+from pipeprog_node.journal import Journal
 from tests.fuzz.fuzzed_messages import png_header
 
 CAMERA = Camera(640, 360, 450.0, 450.0, 319.5, 179.5)
@@ -44,7 +47,9 @@ def view(wall: NDArray[np.uint8], x: int) -> NDArray[np.uint8]:
 class Stage:
     """The node under test, the camera's topics, and what the SfM hears and answers."""
 
-    def __init__(self, arguments: list[str], image_type: type, image: str, camera_info: str) -> None:
+    def __init__(
+        self, arguments: list[str], image_type: type, image: str, camera_info: str, idle: bool = False
+    ) -> None:
         rclpy.init(args=["--ros-args", "--log-level", "error", *arguments])
         self.node = FramesNode()
         self.others = Node("others")
@@ -66,7 +71,8 @@ class Stage:
             self._executor.add_node(node)
         self.spin_until(
             lambda: (
-                min(topic.get_subscription_count() for topic in (self._images, self._infos, self._overlaps)) > 0
+                (idle or min(topic.get_subscription_count() for topic in (self._images, self._infos)) > 0)
+                and self._overlaps.get_subscription_count() > 0
                 and self.others.count_publishers("keyframes/image/compressed") > 0
             )
         )
@@ -128,8 +134,9 @@ def stage() -> Iterator[Callable[..., Stage]]:
         image_type: type = CompressedImage,
         image: str = "image/compressed",
         camera_info: str = "camera_info",
+        idle: bool = False,
     ) -> Stage:
-        stages.append(Stage(list(arguments), image_type, image, camera_info))
+        stages.append(Stage(list(arguments), image_type, image, camera_info, idle))
         return stages[-1]
 
     yield make
@@ -152,6 +159,26 @@ def report(stamp: int, overlap: float, before: int, after: int) -> ImageOverlap:
         matches_previous=before,
         matches_next=after,
     )
+
+
+def test_a_survey_that_is_taken_up_has_its_last_keyframes_published_again(
+    stage: Callable[..., Stage], tmp_path: Path
+) -> None:
+    """They may not have arrived; nodes that are started anew themselves get them as well."""
+    journal = Journal(tmp_path / "frames.journal")
+    for number in range(KEPT + 2):
+        journal.write(number, EncodedFrame(START + number, "camera", b"a JPEG", CAMERA))
+    journal.write(journal.end, [START])
+    journal.close()
+    scene = stage("-p", "idle:=true", "-p", f"journal:={tmp_path}", idle=True)
+    scene.keyframes.clear()
+    listen = scene.others.create_subscription
+    listen(CompressedImage, "keyframes/image/compressed", scene.keyframes.append, qos.kept(2 * KEPT))
+    listen(KeyframesRetired, "keyframes/retired", scene.retired.append, qos.kept(KEPT))
+    scene.spin_until(lambda: len(scene.keyframes) >= KEPT - 1 and scene.retired)
+    assert scene.chosen() == [START + number for number in range(3, KEPT + 2)]
+    assert scene.retired[-1].keyframes_published == KEPT + 2
+    assert scene._counted("keyframes") == KEPT + 2
 
 
 def test_cameras_that_are_triggered_together_have_stamps_of_their_own(

@@ -5,10 +5,12 @@ import errno
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 from typing import IO
 
 import pytest
 
+from pipeprog_camera.errors import InputError
 from pipeprog_node.journal import Journal
 
 READ = "import pickle, sys; print(list(pickle.loads(bytes.fromhex(sys.argv[1]))))"
@@ -41,6 +43,40 @@ def test_what_there_is_no_room_for_is_not_in_the_record(monkeypatch: pytest.Monk
     journal.write(2, "third")
     assert list(journal.record(3)) == ["first", "third"]
     journal.close()
+
+
+def test_what_a_killed_process_wrote_is_taken_up_less_what_was_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    killed = Journal(path)
+    for number in range(4):
+        killed.write(number, ("command", number), waits=number > 0)
+    killed.answered(1)
+    killed.remove(2)
+    killed.write_note("first")
+    killed.write_note("second")
+    killed.write(4, bytes(10_000))
+    whole = path.read_bytes()
+    for cut in (len(whole) - 1, len(whole) - 5_000, len(whole) - 10_020):
+        path.write_bytes(whole[:cut])
+        taken = Journal(path)
+        assert list(taken.commands()) == [(0, ("command", 0)), (1, ("command", 1)), (3, ("command", 3))]
+        assert (list(taken.waiting), taken.note, taken.end) == ([3], "second", 4)
+        taken.write(4, "later")
+        taken.close()
+        again = Journal(path)
+        assert list(again.record(5))[-1] == "later"
+
+
+def test_a_journal_that_others_may_have_written_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    Journal(path).write(0, "command")
+    path.chmod(0o666)
+    with pytest.raises(InputError, match="others"):
+        Journal(path)
+    path.chmod(0o600)
+    (tmp_path / "link").symlink_to(path)
+    with pytest.raises(InputError, match="link"):
+        Journal(tmp_path / "link")
 
 
 def full(command: object, file: IO[bytes]) -> None:

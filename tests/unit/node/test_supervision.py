@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
@@ -42,10 +43,10 @@ class Worker:
 class Stage:
     """All workers that were started, and the time [s]."""
 
-    def __init__(self) -> None:
+    def __init__(self, journal: Journal | None = None) -> None:
         self.workers: list[Worker] = []
         self.now = 0.0
-        self.supervision = Supervision(self.start, "the worker", lambda: self.now)
+        self.supervision = Supervision(self.start, "the worker", lambda: self.now, journal)
         self.supervision.ready()
 
     def start(self, record: Iterable[Step]) -> Worker:
@@ -186,5 +187,22 @@ def test_a_full_disk_costs_what_is_not_written_and_no_node(stage: Stage, monkeyp
     assert any("no room" in name for name in stage.supervision.health())
 
 
-def full(journal: Journal, number: int, command: Step) -> None:
+def test_a_process_in_place_of_one_that_was_killed_takes_up_its_journal(tmp_path: Path) -> None:
+    killed = Stage(Journal(tmp_path / "journal"))
+    killed.supervision.keep(FIRST)
+    for command in (SECOND, THIRD, FOURTH):
+        killed.supervision.send(command)
+    killed.supervision.answered()
+    killed.supervision.note("a note")
+    journal = Journal(tmp_path / "journal")
+    after = Stage(journal)
+    assert (after.workers[0].record, after.workers[0].sent) == ([FIRST, SECOND], [THIRD, FOURTH])
+    assert (after.supervision.backlog, journal.note) == (2, "a note")
+    after.supervision.answered()
+    assert after.supervision.keep(END) == 4
+    after.die()
+    assert (after.workers[1].record, after.workers[1].sent) == ([FIRST, SECOND, THIRD], [FOURTH])
+
+
+def full(journal: Journal, number: int, command: Step, waits: bool) -> None:
     raise OSError("no space left on device")

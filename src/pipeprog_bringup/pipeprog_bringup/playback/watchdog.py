@@ -19,7 +19,7 @@ class Watchdog:
         self._moved = time.monotonic()
         self._heard: dict[str, float] = {}
         self._processes: dict[str, str] = {}
-        self._restarted = ""
+        self._restarted: list[str] = []
 
     def moved(self) -> None:
         """An image was sent or answered, or a new stage begins."""
@@ -29,7 +29,13 @@ class Watchdog:
         """A node has sent its diagnostics from this process; empty: it does not say from which."""
         self._heard[name] = time.monotonic()
         if process and self._processes.setdefault(name, process) != process:
-            self._restarted = name
+            self._processes[name] = process
+            self._restarted.append(name)
+
+    def restarted(self) -> list[str]:
+        """The nodes that have died and were started anew since the last call."""
+        names, self._restarted = self._restarted, []
+        return names
 
     def check_movement(self, stage: str, counts: str) -> None:
         """Raises NodeFailure, with `counts` in its text, where nothing has moved for STANDSTILL_SECONDS."""
@@ -37,12 +43,7 @@ class Watchdog:
             raise NodeFailure(f"nothing has moved for {STANDSTILL_SECONDS:.0f} s while {stage}: {counts}")
 
     def check_nodes(self) -> None:
-        """Raises NodeFailure where a node that was heard before was started anew, or is silent for SILENCE_SECONDS."""
-        if self._restarted:
-            raise NodeFailure(
-                f"the node {self._restarted} has died and was started anew: what it had of this survey is lost, "
-                "make the survey once more"
-            )
+        """Raises NodeFailure where a node that was heard before is silent for SILENCE_SECONDS."""
         now = time.monotonic()
         for name, heard in self._heard.items():
             if now - heard > SILENCE_SECONDS:

@@ -69,7 +69,7 @@ class ConductedSurvey:
         passage, settings = self._passage, {}
         survey: LastMessages | None = None
         try:
-            await passage.begin(self._goal, self._output.colmap)
+            await passage.begin(self._goal, self._output.colmap, self._output.journal)
             settings = await passage.settings()
             filming = time.monotonic()
             limit = self._goal.time_limit or math.inf

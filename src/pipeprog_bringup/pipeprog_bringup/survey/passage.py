@@ -34,6 +34,9 @@ CONFIGS = {"frames": FramesConfig, "sfm": SfmConfig, "detect": DetectConfig}
 ANSWER_SECONDS = 30.0  # for a node to begin anew, its imports done: it starts a process of its own, no more
 DELIVERY_SECONDS = 60.0  # for what a node has published already, as in a replay
 
+# s from hearing a process for the first time to calling it: before the two have found each other a call is lost.
+MATCHING_SECONDS = 1.0
+MAX_RESTARTS = 10  # of nodes in a survey; one that dies again and again will not end it
 FINISH_SECONDS = 3600.0  # for all work after filming: 40 s of a field take 5 minutes on two cores
 
 
@@ -52,6 +55,9 @@ class Cancelled(Exception):
 class Passage:
     """The services and topics of the graph for one survey.
 
+    A node that dies and is started anew takes the survey up from its journal, and is asked again what it has not
+    answered.
+
     Attributes:
         log: what became of the frames.
         listener: the last status of the SfM, and answers.
@@ -69,17 +75,24 @@ class Passage:
         self.stage = Survey.Feedback.STARTING
         self._finish = {name: node.create_client(srv.Finish, f"{name}/finish") for name in CONFIGS}
         self._renew = {name: node.create_client(srv.Renew, f"{name}/renew") for name in CONFIGS}
+        self._begun: dict[str, dict[str, Any]] = {}  # how each node has begun this survey: fields of Renew
+        space = node.get_namespace().strip("/")
+        self._names = {f"{space}/{name}".strip("/"): name for name in CONFIGS}  # by how diagnostics call them
+        self._lives = dict.fromkeys(CONFIGS, 0)  # times that each has taken it up
+        self._map_asked: int | None = None  # keyframes of the map that has been made; None: not yet
 
-    async def begin(self, goal: Goal, colmap: Path) -> None:
+    async def begin(self, goal: Goal, colmap: Path, journal: Path) -> None:
         """Lets each node forget the survey before, the one that films last; raises SurveyFailure.
 
-        `colmap`: folder of the sparse model.
+        `colmap`: folder of the sparse model; `journal`: of what the nodes write down.
         """
+        folder = str(journal.resolve())
+        await self._renewed("frames", idle=True)  # what it keeps for nodes that come late is of the survey before
         board = str(goal.site.board_path.resolve()) if goal.site.board_path else ""
-        await self._renewed("detect", boq=str(goal.site.boq_path.resolve()))
+        await self._begin("detect", boq=str(goal.site.boq_path.resolve()), journal=folder)
         reference = str(goal.reference.path) if goal.reference else ""
-        await self._renewed("sfm", board=board, colmap=str(colmap.resolve()), reference=reference)
-        await self._renewed("frames", idle=False)
+        await self._begin("sfm", board=board, colmap=str(colmap.resolve()), reference=reference, journal=folder)
+        await self._begin("frames", idle=False, journal=folder)
         await self._until(self._is_connected, DELIVERY_SECONDS, "the nodes have not found each other")
 
     async def film(self, is_over: Callable[[], bool]) -> None:
@@ -91,6 +104,7 @@ class Passage:
     async def work_off(self) -> LastMessages:
         """Ends filming and waits for the last map and its pipes; raises SurveyFailure where there are none."""
         self.stage = Survey.Feedback.RECONSTRUCTING
+        self._begun["frames"]["idle"] = True  # one that dies from now on takes no more images
         filmed = await self._finished("frames", 0)
         if not filmed.outputs:
             raise self._without_keyframes()
@@ -100,7 +114,7 @@ class Passage:
             lacks_scale = status.models == 1 and not status.metric
             code = Survey.Result.NO_SCALE if lacks_scale else Survey.Result.NO_MAP
             raise SurveyFailure(code, status.message or mapped.message or "nothing was reconstructed")
-        self.stage = Survey.Feedback.MEASURING
+        self.stage, self._map_asked = Survey.Feedback.MEASURING, filmed.outputs
         found = await self._finished("detect", mapped.outputs)
         if not found.success:
             raise SurveyFailure(Survey.Result.UNKNOWN, found.message)
@@ -111,6 +125,7 @@ class Passage:
 
     async def rest(self) -> None:
         """Lets the nodes forget this survey and take no images."""
+        self._begun.clear()
         await self._renewed("frames", idle=True)
         await self._renewed("sfm")
         await self._renewed("detect")
@@ -122,26 +137,56 @@ class Passage:
     async def _settings_of(self, name: str, kind: type) -> dict[str, Any]:
         client = AsyncParameterClient(self._node, name)
         names = [setting.name for setting in describe(kind)]
-        answer = await self._answer(client.get_parameters(names), name, ANSWER_SECONDS)
+        answer = await self._answer(lambda: client.get_parameters(names), name, ANSWER_SECONDS)
         given = {key: parameter_value_to_python(value) for key, value in zip(names, answer.values, strict=True)}
         config: Any = build(kind, {key: value for key, value in given.items() if value is not None})
         return dataclasses.asdict(config)
 
+    async def _begin(self, name: str, **fields: Any) -> None:
+        await self._renewed(name, **fields)
+        self._begun[name] = fields
+
+    async def _take_up(self, name: str) -> None:
+        """Lets a node that was started anew go on where the one before it was killed."""
+        self._lives[name] += 1
+        if sum(self._lives.values()) > MAX_RESTARTS:
+            text = f"nodes of the graph have died {MAX_RESTARTS + 1} times, the last was {name}: see its output"
+            raise SurveyFailure(Survey.Result.PROCESS_DIED, text)
+        if name not in self._begun:
+            return
+        life, matched = self._lives[name], time.monotonic() + MATCHING_SECONDS
+        while time.monotonic() < matched:
+            await self._wait()
+        if self._lives[name] == life:  # it has not died meanwhile
+            await self._renewed(name, **self._begun[name])
+        if self._lives[name] == life and name == "sfm" and self._map_asked is not None:
+            await self._finished("sfm", self._map_asked)  # the map may not have reached the detector
+
     async def _renewed(self, name: str, **fields: Any) -> None:
         client = self._renew[name]
         await self._until(client.service_is_ready, DELIVERY_SECONDS, f"the node {name} is not there")
-        answer = await self._answer(client.call_async(srv.Renew.Request(**fields)), name, ANSWER_SECONDS)
+        request = srv.Renew.Request(**fields)
+        answer = await self._answer(lambda: client.call_async(request), name, ANSWER_SECONDS)
         if not answer.success:
             raise SurveyFailure(Survey.Result.BAD_INPUT, answer.message)
 
     async def _finished(self, name: str, expected: int) -> srv.Finish.Response:
         client: Client = self._finish[name]
         await self._until(client.service_is_ready, DELIVERY_SECONDS, f"the node {name} is not there")
-        return await self._answer(client.call_async(srv.Finish.Request(expected_inputs=expected)), name, FINISH_SECONDS)
+        request = srv.Finish.Request(expected_inputs=expected)
+        return await self._answer(lambda: client.call_async(request), name, FINISH_SECONDS)
 
-    async def _answer(self, future: Future, name: str, seconds: float) -> Any:
-        await self._until(future.done, seconds, f"the node {name} has not answered")
-        return future.result()
+    async def _answer(self, ask: Callable[[], Future], name: str, seconds: float) -> Any:
+        """The answer of a node, which is asked again where it has died over the question."""
+        while True:
+            asked, life = ask(), self._lives[name]
+            await self._until(
+                lambda asked=asked, life=life: asked.done() or self._lives[name] != life,  # type: ignore[misc]
+                seconds,
+                f"the node {name} has not answered",
+            )
+            if asked.done():
+                return asked.result()
 
     async def _until(self, condition: Callable[[], bool], seconds: float, lack: str) -> None:
         deadline = time.monotonic() + seconds
@@ -157,6 +202,9 @@ class Passage:
             self._watchdog.check_nodes()
         except NodeFailure as error:
             raise SurveyFailure(Survey.Result.PROCESS_DIED, str(error)) from None
+        for full_name in self._watchdog.restarted():
+            if full_name in self._names:  # and no other robot's
+                await self._take_up(self._names[full_name])
         await self._tick()
 
     def _is_connected(self) -> bool:

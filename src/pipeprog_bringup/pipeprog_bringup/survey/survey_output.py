@@ -36,6 +36,7 @@ class SurveyOutput:
 
     Attributes:
         path: the folder.
+        journal: folder for what the nodes write down for the case that they are killed; it ends with the survey.
     """
 
     def __init__(self, results: Path, goal: Goal, record: bool) -> None:
@@ -54,6 +55,8 @@ class SurveyOutput:
         self._recording.describe({"site": goal.site.boq_path.stem, "survey": goal.name, "pipeprog": version})
         self._input = self._bag("recording.mcap") if record else None
         self._infos: dict[int, CameraInfo] = {}  # of the keyframes, by stamp
+        self.journal = self._folder.file("journal")
+        self.journal.mkdir()
 
     @property
     def colmap(self) -> Path:
@@ -81,6 +84,7 @@ class SurveyOutput:
 
         `about`: what config.yaml and run.json are to say, under `config` and `run`.
         """
+        shutil.rmtree(self.journal, ignore_errors=True)
         if survey is not None:
             record_survey(self._recording, survey, status)
             cameras = record_cameras(self._recording, survey, self._infos)

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A graph with the node `survey` under a supervisor that starts anew what dies, and a robot that films the demo."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import yaml
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage
+from std_srvs.srv import Trigger
+
+from benchmarks.recordings import ROOT
+from pipeprog_bringup.playback.node_processes import NODE_MODULES
+from pipeprog_bringup.recording.bag import Bag, ImageMessage
+from pipeprog_msgs.action import Survey
+from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray
+from pipeprog_node import messages, qos
+
+MODULES = NODE_MODULES | {"survey": "pipeprog_bringup.survey.node"}
+BOQ, BOARD, DEMO = (ROOT / "bags" / f"demo.{end}" for end in ("boq.yaml", "board.yaml", "mcap"))
+COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # what is measured is the graph, not its accuracy
+RESPAWN_DELAY = 2.0  # s, as the launch file has it
+PERIOD = 0.1  # s between two images
+DEFERRED = 1.0  # s for the decision on an image: the selector takes 10 ms
+PATIENCE = 600.0  # s for what takes a minute on an idle machine
+
+
+class LiveGraph:
+    """Context in which the four nodes run, each a process that is started again after its death."""
+
+    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        """`folder` takes parameter files, logs and, under `surveys`, the results; `settings`: of sfm."""
+        self._folder = folder
+        self._parameters: dict[str, dict[str, Any]] = {
+            "frames": {"idle": True},
+            "sfm": {"map_interval": 4, **settings},
+            "detect": {"boq": str(BOQ)},
+            "survey": {"boq": str(BOQ), "board": str(BOARD), "results": str(folder / "surveys")},
+        }
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._dead_since: dict[str, float] = {}
+
+    def __enter__(self) -> LiveGraph:
+        for name in MODULES:
+            self._start(name)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in self._processes.values():
+            process.kill()
+            process.wait()
+
+    def supervise(self) -> None:
+        """Starts what has been dead for RESPAWN_DELAY; to be called often."""
+        now = time.monotonic()
+        for name, process in self._processes.items():
+            if process.poll() is not None and now - self._dead_since.setdefault(name, now) > RESPAWN_DELAY:
+                del self._dead_since[name]
+                self._start(name)
+
+    def kill(self, name: str, worker: bool = False) -> bool:
+        """Kills a node's process, or the child in which it computes; whether there was one."""
+        number = self._processes[name].pid
+        found = _workers(number) if worker else [number] * (self._processes[name].poll() is None)
+        for each in found:
+            os.kill(each, signal.SIGKILL)
+        return bool(found)
+
+    def memory(self) -> dict[str, float]:
+        """MB that each process holds for itself: its unique set, its worker's without."""
+        return {name: _unique_mb(process.pid) for name, process in self._processes.items()}
+
+    def _start(self, name: str) -> None:
+        file = self._folder / f"{name}.yaml"
+        file.write_text(yaml.safe_dump({name: {"ros__parameters": self._parameters[name]}}))
+        command = [sys.executable, "-m", MODULES[name], "--ros-args", "-r", f"__node:={name}"]
+        with (self._folder / f"{name}.log").open("ab") as log:
+            self._processes[name] = subprocess.Popen(
+                [*command, "--params-file", str(file)], stdout=log, stderr=subprocess.STDOUT
+            )
+
+
+def _workers(number: int) -> list[int]:
+    """Children of a process that compute: those of multiprocessing, less the one that tracks its resources."""
+    children = Path(f"/proc/{number}/task/{number}/children").read_text().split()
+    return [int(each) for each in children if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
+
+
+def _unique_mb(number: int) -> float:
+    text = Path(f"/proc/{number}/smaps_rollup").read_text()
+    rows = [line.split() for line in text.splitlines()[1:]]
+    return sum(int(row[1]) for row in rows if row[0].startswith("Private_")) / 1024.0
+
+
+class Robot:
+    """A robot whose camera never rests, and the client of its surveys."""
+
+    def __init__(self, graph: LiveGraph, frames: Sequence[ImageMessage], patient: bool = False) -> None:
+        """`frames`: what it passes on its walk; it goes on once an image of a place was decided on.
+
+        patient: it sends each image once, under its own stamp, and goes on once the SfM has answered to all keyframes.
+        """
+        self._graph, self._frames, self._patient = graph, frames, patient
+        self._chosen = self._answered = 0  # keyframes
+        self._is_over, self._shown_at = False, 0.0
+        self.feedback: list[Survey.Feedback] = []
+        self._node = Node("robot")
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._images = self._node.create_publisher(CompressedImage, "image/compressed", qos.reliable(10))
+        self._infos = self._node.create_publisher(CameraInfo, "camera_info", qos.reliable(10))
+        self._stamps = itertools.count(1_700_000_000_000_000_000, 200_000_000)
+        self._place = 0
+        self._shown = self._decided = 0  # stamps of the first image of that place, and of the last decision
+        self._node.create_subscription(FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
+        self._node.create_subscription(ImageOverlapArray, "image_overlap", self._on_answer, qos.kept(50))
+        self._node.create_timer(PERIOD, self._film)
+        self._client = ActionClient(self._node, Survey, "survey")
+        self._state = self._node.create_client(ChangeState, "survey/change_state")
+        self._end = self._node.create_client(Trigger, "survey/end")
+
+    @property
+    def is_at_the_end(self) -> bool:
+        """Whether the walk is over."""
+        return self._place == len(self._frames) - 1 and self._has_passed
+
+    def activate(self) -> None:
+        """Configures and activates the node survey."""
+        for step in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            assert self._called(self._state, ChangeState.Request(transition=Transition(id=step))).success
+
+    def survey(self, name: str, each: Callable[[], None] = lambda: None) -> Any:
+        """Walks once, and returns the answer of the action; `each` is called again and again meanwhile."""
+        self.feedback.clear()
+        self._place, self._shown, self._decided = -1, 0, 0
+        self._chosen = self._answered = 0
+        self._is_over = False
+        self.wait_for(self._client.server_is_ready)
+        sent = self._client.send_goal_async(
+            Survey.Goal(survey_id=name), lambda heard: self.feedback.append(heard.feedback)
+        )
+        self.wait_for(sent.done)
+        assert sent.result().accepted
+        over = sent.result().get_result_async()
+        self.wait_for(lambda: over.done() or (self._is_filming() and self.is_at_the_end), each)
+        if not over.done():
+            self._called(self._end, Trigger.Request())
+        self.wait_for(over.done, each)
+        return over.result()
+
+    def wait_for(self, condition: Callable[[], object], each: Callable[[], None] = lambda: None) -> None:
+        """Lets time pass until a condition holds; raises TimeoutError after PATIENCE."""
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"waited {PATIENCE:.0f} s in vain")
+            self._executor.spin_once(timeout_sec=PERIOD)
+            self._graph.supervise()
+            each()
+
+    def _is_filming(self) -> bool:
+        return bool(self.feedback) and self.feedback[-1].state == Survey.Feedback.FILMING
+
+    def _called(self, client: Any, request: Any) -> Any:
+        self.wait_for(client.service_is_ready)
+        answer = client.call_async(request)
+        self.wait_for(answer.done)
+        return answer.result()
+
+    def _film(self) -> None:
+        if not self._is_filming() or self._is_over:
+            return
+        stamp, is_new = next(self._stamps), self._has_passed
+        if is_new:
+            self._place = min(self._place + 1, len(self._frames) - 1)
+            self._shown = self._frames[self._place].stamp if self._patient else stamp
+            self._shown_at = time.monotonic()
+        if self._patient and not is_new:
+            return
+        self._is_over = self._patient and self._place == len(self._frames) - 1
+        frame = self._frames[self._place]
+        info = deserialize_message(frame.camera_info, CameraInfo)
+        image = deserialize_message(frame.data, CompressedImage)
+        info.header = image.header = messages.header(self._shown if self._patient else stamp, frame.frame_id)
+        self._infos.publish(info)
+        self._images.publish(image)
+
+    @property
+    def _has_passed(self) -> bool:
+        """Whether the place that it shows is done with."""
+        is_decided = self._decided >= self._shown
+        if not self._patient:
+            return is_decided
+        # The selector may put a decision off until further images have come.
+        waited = time.monotonic() - self._shown_at > DEFERRED
+        return self._answered >= self._chosen and (is_decided or waited)
+
+    def _on_decision(self, message: FrameDecision) -> None:
+        self._decided = max(self._decided, messages.stamp_ns(message.header.stamp))
+        self._chosen += message.chosen
+
+    def _on_answer(self, message: ImageOverlapArray) -> None:
+        self._answered = message.keyframes_considered
+
+
+def demo_frames() -> list[ImageMessage]:
+    """The demo from the first frame that shows the whole board on."""
+    return list(Bag.open(DEMO))[3:]
