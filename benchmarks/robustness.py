@@ -125,10 +125,11 @@ def main(factors: list[str]) -> None:
     for factor in factors or list(FACTORS):
         for value, shot in FACTORS[factor].items():
             rows[factor, value] = {"factor": factor, "value": value, **_figures(shot)}
-            content = {"title": TITLE, "command": "python -m benchmarks.robustness", "rows": list(rows.values())}
+            ordered = [rows[key] for key in ((f, v) for f in FACTORS for v in FACTORS[f]) if key in rows]
+            content = {"title": TITLE, "command": "python -m benchmarks.robustness", "rows": ordered}
             target.write_text(json.dumps(content, indent=1) + "\n")
             print(rows[factor, value], flush=True)
-            _draw(list(rows.values()))
+            _draw(ordered)
 
 
 def _figures(shot: Shot) -> dict[str, Any]:

@@ -161,9 +161,10 @@ def _failures(results: Mapping[str, Result]) -> list[str]:
         "[recordings](results/recordings.md)).",
         f"Few images: at 75 % overlap F falls to {cell(sparse.get('F'))} in fields "
         "([field](results/experiments_field.md)).",
-        f"Phones at walking speed (0.75 m/s): with a rolling shutter of {' or '.join(shutter)} ms that is not told the "
-        "board contradicts its file, and the survey ends with that message and without a result; with an exposure of "
-        f"12 ms {cell(dark.get('right class'))} pipes are found ([robustness](results/robustness.md)).",
+        f"Phones at walking speed (0.75 m/s): with a rolling shutter of {' or '.join(shutter)} ms that was not told "
+        "the board contradicted its file and the survey ended without a result; that was before the read-out was taken "
+        f"from the images ([recording](recording.md)). With an exposure of 12 ms {cell(dark.get('right class'))} pipes "
+        "are found ([robustness](results/robustness.md)).",
         f"A lens that was not calibrated: with k1 off by 0.05 the scale is {cell(lens.get('scale error [%]'))} % off, "
         f"and {cell(lens.get('right class'))} pipes are found ([robustness](results/robustness.md)).",
         f"Pipes seen from inside of which less than half the circumference shows: {cell(sewer.get('right'))} of "

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CompressedImage
 
+from benchmarks import robustness
 from benchmarks.recordings import DEMO, Recording
 from benchmarks.robustness import Shot
 from pipeprog_bringup.recording.bag import Bag
@@ -40,6 +42,20 @@ def test_noise_is_as_strong_as_said(plain: Recording) -> None:
     difference = levels[1].astype(float) - levels[0]
     # Clipping at black and white, and the JPEG's colour at half the size, take some of it away.
     assert 7.0 < difference.std() < 12.5
+
+
+def test_factors_that_are_not_named_keep_their_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = {"factor": "resolution", "value": "4k", "F": 1.0, "commit": "old"}
+    stale = {"factor": "image noise [grey levels]", "value": "5", "F": 0.5, "commit": "old"}
+    result = tmp_path / "robustness.json"
+    result.write_text(json.dumps({"rows": [kept, stale]}))
+    monkeypatch.setattr(robustness, "RESULTS", tmp_path)
+    monkeypatch.setattr(robustness, "_draw", lambda rows: None)
+    monkeypatch.setattr(robustness, "_figures", lambda shot: {"F": 1.0, "commit": "new"})
+    robustness.main(["image noise [grey levels]"])
+    rows = json.loads(result.read_text())["rows"]
+    assert rows[-1] == kept
+    assert [(row["value"], row["commit"]) for row in rows[:-1]] == [("1", "new"), ("5", "new"), ("12", "new")]
 
 
 def _image(message: bytes) -> bytes:
