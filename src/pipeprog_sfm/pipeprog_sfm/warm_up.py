@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -17,10 +19,13 @@ from pipeprog_sfm.reconstruction import Reconstruction
 SIZE = (320, 240)
 DEPTHS = (0.7, 1.5)
 STEP = 24  # px between two views of a wall at 1 m
+FEATURES = 600  # of a view: thrice the tie points that self-calibration asks for
+REACH = 2  # views on either side that a depth map is made with
 
 
 def warm_up(config: SfmConfig) -> None:
     """Runs each stage on a few views of a plane; takes about a second once everything is compiled."""
+    config = replace(config, mapper=replace(config.mapper, max_features=FEATURES))
     width, height = SIZE
     camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2)
     wall = np.random.default_rng(0).integers(0, 256, (height // 4, width), np.uint8)
@@ -35,8 +40,8 @@ def warm_up(config: SfmConfig) -> None:
         views.append(StereoImage(number, image, camera, pose))
         reconstruction.add(number, cv2.imencode(".png", image)[1].tobytes(), camera)
         reconstruction.overlap_reports()
-    maps = [depth_map(view, [other for other in views if other is not view], DEPTHS, config.stereo) for view in views]
     fusion = Fusion(config.fusion)
-    for view, depth in zip(views, maps, strict=True):
-        fusion.add(depth, view.camera_from_world, 1.0)
+    for view in views:
+        others = [other for other in views if 0 < abs(other.stamp - view.stamp) <= REACH]
+        fusion.add(depth_map(view, others, DEPTHS, config.stereo), view.camera_from_world, 1.0)
     fusion.cloud()
