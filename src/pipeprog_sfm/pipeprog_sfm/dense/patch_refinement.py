@@ -28,7 +28,7 @@ NOISE = 0.7  # [grey levels] of two 8-bit images' difference at best
 FLATNESS = 2e-4  # of the depth: how far a pipe of 50 mm bulges over the plane's 9 px at 2 m, 0.4 mm
 OVERLAP = (2 * RADIUS + 1) ** 2 / 4.0  # patches that share a pixel on a grid of stride 2: their errors go together
 ROW_STEPS = 1  # after the first, from the row at the stamp to the one that shows a patch: 0.01 px are left
-ROUNDS = (1, 2, 0)  # distance in grid pixels at which each round takes over planes; 0: none
+ROUNDS = (4, 2)  # distance in grid pixels at which each round takes over planes: beyond PLANE_RADIUS, on other data
 
 
 def refine(
@@ -82,13 +82,13 @@ def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
     smooth = inverse_depth.copy()
     slant = np.zeros((height, width, 2), np.float32)
     for v in prange(height):
-        sums, scratch = np.zeros((10, width)), np.empty((4, width))
+        sums, scratch = np.zeros((10, width), np.float32), np.empty((4, width), np.float32)
         for i in range(max(0, v - PLANE_RADIUS), min(height, v + PLANE_RADIUS + 1)):
             for shift in range(-PLANE_RADIUS, PLANE_RADIUS + 1):
                 low, high = max(0, -shift), width - max(0, shift)
                 _add_neighbours(
                     inverse_depth[v, low:high], inverse_depth[i, low + shift : high + shift],
-                    sigma[i, low + shift : high + shift], float(shift), float(i - v), sums, low, scratch,
+                    sigma[i, low + shift : high + shift], np.float32(shift), np.float32(i - v), sums, low, scratch,
                 )  # fmt: skip
         for u in range(width):
             centre = inverse_depth[v, u]
@@ -118,17 +118,17 @@ def _add_neighbours(centres, others, sigmas, du, dv, sums, low, scratch):  # typ
     same, away, weight, moment = scratch[0, :size], scratch[1, :size], scratch[2, :size], scratch[3, :size]
     for u in range(size):
         w = others[u] - centres[u]
-        near = abs(w) < SAME_SURFACE * centres[u]
-        same[u] = 1.0 if near else 0.0
-        away[u] = w if near else 0.0
+        near = abs(w) < np.float32(SAME_SURFACE) * centres[u]
+        same[u] = np.float32(1.0) if near else np.float32(0.0)
+        away[u] = w if near else np.float32(0.0)
     for u in range(size):
-        weight[u] = 1.0 / (sigmas[u] * sigmas[u]) if same[u] > 0.0 else 0.0
+        weight[u] = same[u] / (sigmas[u] * sigmas[u])
         moment[u] = weight[u] * away[u]
-    for k, factor in enumerate((1.0, du, dv, du * du, du * dv, dv * dv)):
+    for k, factor in enumerate((np.float32(1.0), du, dv, du * du, du * dv, dv * dv)):
         _add_times(weight, factor, sums[k, low : low + size])
-    for k, factor in enumerate((1.0, du, dv)):
+    for k, factor in enumerate((np.float32(1.0), du, dv)):
         _add_times(moment, factor, sums[6 + k, low : low + size])
-    _add_times(same, 1.0, sums[9, low : low + size])
+    _add_times(same, np.float32(1.0), sums[9, low : low + size])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -170,7 +170,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
                 energy += patch[k] * patch[k]
             best_depth = best_step = best_sigma = np.float32(0.0)
             best = np.float32(-2.0)
-            for candidate in range(5 if distance > 0 else 1):
+            for candidate in range(5):
                 i, j = row, column
                 if candidate == 1:
                     j -= distance

@@ -28,7 +28,7 @@ def test_a_flat_view_matches_nothing() -> None:
 def test_a_textured_view_places_the_wall() -> None:
     inverse, correlation, sigma = _refined(None)
     inner = np.s_[4:-4, 6:-6]
-    assert np.abs(inverse[inner] - 1.0).max() < 0.003  # of 0.01 at the start; white noise is no linear texture
+    assert np.abs(inverse[inner] - 1.0).max() < 0.005  # 0.02 px, of 0.01 at the start; white noise is no linear texture
     assert correlation[inner].min() > 0.95
     assert correlation.max() < 1.0 + 1e-3
     assert sigma[inner].max() < 0.005
