@@ -333,9 +333,8 @@ def _adjusted(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[
     """
     state = _State(model.rotation.copy(), model.translation.copy(), model.points[problem.ids], np.zeros(4))
     cost, damping = problem.cost(state, told), 1e-4
+    rows = problem.linearised(state)
     for _ in range(MAX_ITERATIONS):
-        rows = problem.linearised(state)
-        sigmas = _sigmas(problem, state, rows)
         before = state.numbers
         while damping < 1e3:
             step = _Reduced(problem, state, rows, damping).step((told - state.numbers) / problem.prior**2)
@@ -347,17 +346,22 @@ def _adjusted(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[
             damping *= 10
         else:
             break
-        if (np.abs(state.numbers - before) <= CONVERGED * sigmas).all():
-            break
-    return state, _sigmas(problem, state, problem.linearised(state))
+        rows = problem.linearised(state)
+        change = np.abs(state.numbers - before)
+        if (change <= CONVERGED * problem.prior).all():  # the data only make the standard deviations smaller
+            sigmas = _sigmas(_Reduced(problem, state, rows, 0.0), rows)
+            if (change <= CONVERGED * sigmas).all():
+                return state, sigmas
+    return state, _sigmas(_Reduced(problem, state, rows, 0.0), rows)
 
 
 def _readout_change(problem: _Problem, model: SparseModel, told: FloatArray) -> tuple[float, float]:
     """What one Gauss-Newton step of all numbers makes of the read-out, s, and its standard deviation; told as above."""
     state = _State(model.rotation, model.translation, model.points[problem.ids], np.zeros(4))
     rows = problem.linearised(state)
-    numbers = _Reduced(problem, state, rows, 0.0).step(told / problem.prior**2)[1]
-    return float(numbers[3]), float(_sigmas(problem, state, rows)[3])
+    reduced = _Reduced(problem, state, rows, 0.0)
+    numbers = reduced.step(told / problem.prior**2)[1]
+    return float(numbers[3]), float(_sigmas(reduced, rows)[3])
 
 
 def _moved(state: _State, poses: FloatArray, numbers: FloatArray, moves: FloatArray) -> _State:
@@ -367,19 +371,19 @@ def _moved(state: _State, poses: FloatArray, numbers: FloatArray, moves: FloatAr
     return _State(rotation, translation, state.points + moves, state.numbers + numbers)
 
 
-def _sigmas(problem: _Problem, state: _State, rows: _Rows) -> FloatArray:
+def _sigmas(reduced: _Reduced, rows: _Rows) -> FloatArray:
     """(4,) standard deviations of the numbers: errors of points independent (sandwich covariance), with the prior.
 
     As `function_covariance` of the bundle adjustment.
     """
-    reduced = _Reduced(problem, state, rows, 0.0)
+    problem = reduced.problem
     poses = -reduced.solved @ reduced.corner
     none = np.zeros((len(problem.ids), 3))
     moves = np.stack([reduced.moves(none, *each) for each in zip(poses.T, reduced.corner, strict=True)], axis=-1)
     turned = np.concatenate([np.zeros((1, 6, 4)), poses.reshape(-1, 6, 4)])  # the first view stays
     lines = rows.by_pose @ turned[problem.view] + rows.by_number @ reduced.corner + rows.by_point @ moves[problem.owner]
     scores = np.add.reduceat(np.einsum("kin,ki->kn", lines, rows.residuals), problem.start[:-1], axis=0)
-    observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + 6 * len(state.rotation) + 4 - 6
+    observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + 6 * len(turned) + 4 - 6
     spread = np.diag(scores.T @ scores) * observed / max(observed - unknown, 1)
     by_prior = (reduced.corner / problem.prior[:, None]) ** 2
     return np.sqrt(spread + by_prior.sum(axis=0))
