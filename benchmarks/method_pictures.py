@@ -48,7 +48,7 @@ from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import load_board_file
 from pipeprog_sfm.boards.ellipses import detect_ellipses
 from pipeprog_sfm.config import BoardConfig, MapperConfig, StereoConfig
-from pipeprog_sfm.dense.stereo import StereoImage, choose_pairs, depth_map
+from pipeprog_sfm.dense.stereo import Picture, StereoImage, choose_pairs, depth_map
 from pipeprog_sfm.features.sift import extract
 
 FloatArray = NDArray[np.float64]
@@ -218,9 +218,9 @@ def depth(survey: Survey, figure: Figure) -> None:
     number = 18
     view_from_map = np.linalg.inv(survey.poses)
     everyone = {k: view_from_map[k] for k in range(len(survey.poses))}
-    images = {k: StereoImage(k, survey.images[k], survey.camera, everyone[k]) for k in everyone}
+    images = {k: StereoImage(k, Picture(survey.images[k], survey.camera), everyone[k]) for k in everyone}
     neighbours = choose_pairs(number, everyone, 2.0, StereoConfig())
-    found = depth_map(images[number], [images[k] for k in neighbours], (0.8, 5.0), StereoConfig())
+    found = depth_map(images[number], [images[k] for k in neighbours], (0.8, 5.0))
     left, right = figure.subplots(1, 2)
     _photo(left, survey.images[number])
     left.set_title("keyframe")

@@ -13,7 +13,7 @@ from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.camera_in_use import FIRST_CHECK
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.dense.depth_fusion import Fusion
-from pipeprog_sfm.dense.stereo import StereoImage, depth_map
+from pipeprog_sfm.dense.stereo import Picture, StereoImage, depth_map
 from pipeprog_sfm.reconstruction import Reconstruction
 
 SIZE = (320, 240)
@@ -37,11 +37,11 @@ def warm_up(config: SfmConfig) -> None:
         image = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR)
         pose = np.eye(4)
         pose[0, 3] = -number * STEP / camera.fx
-        views.append(StereoImage(number, image, camera, pose))
+        views.append(StereoImage(number, Picture(image, camera), pose))
         reconstruction.add(number, cv2.imencode(".png", image)[1].tobytes(), camera)
         reconstruction.overlap_reports()
     fusion = Fusion(config.fusion)
     for view in views:
         others = [other for other in views if 0 < abs(other.stamp - view.stamp) <= REACH]
-        fusion.add(depth_map(view, others, DEPTHS, config.stereo), view.camera_from_world, 1.0)
+        fusion.add(depth_map(view, others, DEPTHS), view.camera_from_world, 1.0)
     fusion.cloud()

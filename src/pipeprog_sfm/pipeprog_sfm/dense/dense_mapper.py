@@ -13,7 +13,6 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
@@ -23,17 +22,17 @@ from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
 from pipeprog_sfm.dense.stereo import (
     DepthMap,
+    Picture,
     StereoImage,
     choose_pairs,
     depth_map,
-    working_image,
     working_size,
 )
 from pipeprog_sfm.types import EncodedImage
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
 SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits for no more than these
-IMAGE_CACHE = 12  # decoded keyframes at working resolution: a depth map's neighbours are mostly the last few
+PICTURES = 12  # of keyframes at working resolution, 11 MB each at 720p: neighbours are mostly the last few
 NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
 SAMPLE = 200  # points of a keyframe from which its overlap with others is estimated, to 0.04
@@ -79,7 +78,7 @@ class DenseMapper:
         # On a straight walk a point is visible in 1 / (1 - overlap) depth maps. That is four times the number that
         # must agree on it: in the others it may be occluded, oblique, blurred, or too thin to be matched.
         self._overlap = 1.0 - 1.0 / (4 * fusion.min_views)
-        self._image = lru_cache(maxsize=IMAGE_CACHE)(_decode)
+        self._picture = lru_cache(maxsize=PICTURES)(_picture)
         self._depths: dict[int, Future[_Depth]] = {}
         self._waiting: deque[Callable[[], None]] = deque()
         self._submitted: deque[Future[None]] = deque()
@@ -204,10 +203,10 @@ class DenseMapper:
     def _depth(self, views: list[_Source], depth_range: tuple[float, float]) -> _Depth:
         width = self._stereo_config.width
         images = [
-            StereoImage(view.stamp, *self._image(view.image, width), view.pose, view.rolled(width)) for view in views
+            StereoImage(view.stamp, self._picture(view.image, width), view.pose, view.rolled(width)) for view in views
         ]
         reference, neighbours = images[0], images[1:]
-        result = depth_map(reference, neighbours, depth_range, self._stereo_config)
+        result = depth_map(reference, neighbours, depth_range)
         pose = reference.camera_from_world
         return _Depth(result, {other.stamp: distance(pose, other.camera_from_world) for other in neighbours})
 
@@ -275,11 +274,11 @@ def centre(camera_from_world: FloatArray) -> FloatArray:
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
 
 
-def _decode(image: EncodedImage, width: int) -> tuple[NDArray[np.uint8], Camera]:
+def _picture(image: EncodedImage, width: int) -> Picture:
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
     assert pixels is not None  # the mapper has read it
     undistorted = image.camera.undistort_image(pixels.astype(np.uint8, copy=False))
-    return working_image(undistorted, image.camera.pinhole(), width)
+    return Picture.reduced(undistorted, image.camera.pinhole(), width)
 
 
 def _motion(motions: Mapping[int, RowMotion], stamp: int) -> RowMotion | None:

@@ -34,7 +34,7 @@ ROUNDS = (4, 2)  # distance in grid pixels at which each round takes over planes
 def refine(
     inverse_depth: NDArray[np.float32],
     image: NDArray[np.float32],
-    neighbours: NDArray[np.uint8],
+    neighbours: NDArray[np.uint32],
     homographies: NDArray[np.float64],
     epipoles: NDArray[np.float64],
     stride: int,
@@ -42,25 +42,25 @@ def refine(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Inverse depth on a grid of every `stride`-th pixel of `image`, improved; its correlation; its relative sigma.
 
-    A pixel (u, v) of inverse depth i lies at homographies[n] @ (u, v, 1) + i * epipoles[n] of neighbour n (N, h, w);
-    with rolling `rows` that is so at the stamps, and inverse depth is on the optical axis of each row's own pose.
+    `neighbours` (N, h, w) are the `fours` of N images. A pixel (u, v) of inverse depth i lies at
+    homographies[n] @ (u, v, 1) + i * epipoles[n] of them; with rolling `rows` that is so at the stamps, and inverse
+    depth is on the optical axis of each row's own pose.
     The correlation is the mean of the better half of the views, so that an occluded side does no harm; sigma follows
     from the patches' gradients and residuals. All outputs have the grid's shape; inverse depth NaN where unknown.
     """
     homographies, epipoles = homographies.astype(np.float32), epipoles.astype(np.float32)
     better_half = (len(neighbours) + 1) // 2
-    fours = np.stack([_fours(neighbour) for neighbour in neighbours])
     correlation = np.zeros_like(inverse_depth)
     sigma = np.full_like(inverse_depth, FLATNESS)
     for distance in ROUNDS:
         inverse_depth, slant = _smooth(inverse_depth, sigma, stride)
         inverse_depth, correlation, sigma = _round(
-            inverse_depth, slant, image, fours, homographies, epipoles, better_half, distance, stride, rows
+            inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride, rows
         )
     return _smooth(inverse_depth, sigma, stride)[0], correlation, sigma
 
 
-def _fours(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
+def fours(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
     """(h, w) of an image: a pixel with those right of it, below and below right, from the lowest byte on.
 
     One load then gives what a place between pixels is interpolated from.
@@ -209,7 +209,7 @@ def _match(  # type: ignore[no-untyped-def]
     """Mean correlation over the better half of the views, Gauss-Newton step of the inverse depth, sigma (0: unseen).
 
     `patch` (SIZE,) is the reference's patch less its mean, `energy` the sum of its squares; `neighbours` (N, h, w)
-    hold four pixels each (`_fours`).
+    hold four pixels each (`fours`).
     """
     one, size = np.float32(1.0), np.float32(SIZE)
     gradient, curvature, residual, used = np.float32(0.0), np.float32(0.0), np.float32(0.0), 0

@@ -25,8 +25,8 @@ _UNSEEN = _BITS // 2  # cost of a view that does not see the point: no opinion
 
 
 def sweep(
-    image: NDArray[np.float32],
-    neighbours: NDArray[np.float32],
+    codes: NDArray[np.uint32],
+    others: NDArray[np.uint32],
     homographies: NDArray[np.float64],
     epipoles: NDArray[np.float64],
     inverse_range: tuple[float, float],
@@ -34,11 +34,12 @@ def sweep(
 ) -> NDArray[np.float32]:
     """(h, w) inverse depth of the reference image, NaN at the ends of the range.
 
-    `neighbours` (N, h2, w2) are images of OVERSAMPLING times the resolution, low-passed alike; a pixel (u, v) of
-    inverse depth i lies at the homogeneous pixel homographies[n] @ (u, v, 1) + i * epipoles[n] of them; with rolling
-    `rows` that is so at the stamps, and inverse depth is on the optical axis of each row's own pose.
+    `codes` (h, w) are its `census`, `others` (N, h2, w2) those of its neighbours, images of OVERSAMPLING times the
+    resolution, low-passed alike; a pixel (u, v) of inverse depth i lies at the homogeneous pixel
+    homographies[n] @ (u, v, 1) + i * epipoles[n] of them; with rolling `rows` that is so at the stamps, and inverse
+    depth is on the optical axis of each row's own pose.
     """
-    height, width = image.shape
+    height, width = codes.shape
     least, most = inverse_range
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float).T
     longest = 0.0  # track of a pixel over the range
@@ -50,8 +51,8 @@ def sweep(
     count = int(np.clip(np.ceil(longest) + 1, 8, MAX_HYPOTHESES))
     step = (most - least) / (count - 1)
     costs = _cost_volume(
-        _census(image, 1),
-        np.stack([_census(neighbour, OVERSAMPLING) for neighbour in neighbours]),
+        codes,
+        others,
         homographies.astype(np.float32),
         epipoles.astype(np.float32),
         np.float32(least),
@@ -64,7 +65,7 @@ def sweep(
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _census(image, stride):  # type: ignore[no-untyped-def]
+def census(image, stride):  # type: ignore[no-untyped-def]
     """Bit string of a pixel: which pixels around it, `stride` apart, are darker. 0 at the border: unknown."""
     height, width = image.shape
     margin = RADIUS * stride

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -14,8 +15,8 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_sfm.config import StereoConfig
-from pipeprog_sfm.dense.patch_refinement import refine
-from pipeprog_sfm.dense.plane_sweep import OVERSAMPLING, sweep
+from pipeprog_sfm.dense.patch_refinement import fours, refine
+from pipeprog_sfm.dense.plane_sweep import OVERSAMPLING, census, sweep
 from pipeprog_sfm.dense.row_mapping import RowMapping, depth_at_the_stamp, row_mapping
 
 FloatImage = NDArray[np.float32]
@@ -33,16 +34,48 @@ CORRELATION_MIN = 0.5  # of patches: at 0.5 signal and noise have the same power
 SIGMA_MAX = 0.005  # of the depth, half of AGREEMENT in fusion: two maps then agree within 0.01 with 84 % probability
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """An undistorted keyframe (H, W, 3) uint8 BGR of a pinhole camera, and what matching takes of it, made once."""
+
+    color: ByteImage
+    camera: Camera
+
+    @classmethod
+    def reduced(cls, image: ByteImage, camera: Camera, width: int) -> Picture:
+        """A picture of `width`, or of its own where it is narrower."""
+        factor = width / camera.width
+        if factor >= 1.0:
+            return cls(image, camera)
+        camera = camera.scaled(factor)
+        resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        return cls(np.asarray(resized, np.uint8), camera)
+
+    @cached_property
+    def gray(self) -> ByteImage:
+        """(H, W)."""
+        return np.asarray(cv2.cvtColor(self.color, cv2.COLOR_BGR2GRAY), np.uint8)
+
+    @cached_property
+    def codes(self) -> NDArray[np.uint32]:
+        """(H, W) census as the sweep reads it of a neighbour."""
+        return census(_low_pass(_without_shading(self.gray.astype(np.float32))), OVERSAMPLING)
+
+    @cached_property
+    def fours(self) -> NDArray[np.uint32]:
+        """(H, W) as the refinement reads them of a neighbour."""
+        return fours(self.gray)
+
+
 @dataclass(frozen=True)
 class StereoImage:
-    """An undistorted keyframe: (H, W, 3) uint8 BGR of a pinhole camera, and its pose in any unit of length.
+    """A keyframe's picture at working resolution, and its pose in any unit of length.
 
-    `rolled`: how its rolling shutter shows the scene, in the same unit, at the image's size.
+    `rolled`: how its rolling shutter shows the scene, in the same unit, at the picture's size or a larger one.
     """
 
     stamp: int
-    image: ByteImage
-    camera: Camera
+    picture: Picture
     camera_from_world: FloatArray
     rolled: RolledImage | None = None
 
@@ -100,13 +133,8 @@ def choose_pairs(
     return [stamp for stamp, _ in chosen]
 
 
-def depth_map(
-    reference: StereoImage,
-    neighbours: Sequence[StereoImage],
-    depth_range: tuple[float, float],
-    config: StereoConfig,
-) -> DepthMap:
-    """Depth of every STRIDE-th pixel of the reference at working resolution; depth_range = (near, far) of the scene.
+def depth_map(reference: StereoImage, neighbours: Sequence[StereoImage], depth_range: tuple[float, float]) -> DepthMap:
+    """Depth of every STRIDE-th pixel of the reference; depth_range = (near, far) of the scene.
 
     A semi-global sweep over all neighbours at reduced resolution finds the surface, patches at full working resolution
     then place it to a fraction of a pixel.
@@ -114,32 +142,32 @@ def depth_map(
     near, far = depth_range
     if not 0.0 < near < far:
         raise ValueError(f"depth range {near:g} to {far:g} is empty")
-    image, camera = working_image(reference.image, reference.camera, config.width)
-    color = cv2.pyrDown(image)  # its pixel (u, v) is centred at (2 u, 2 v)
+    camera = reference.picture.camera
+    color = cv2.pyrDown(reference.picture.color)  # its pixel (u, v) is centred at (2 u, 2 v)
     height, width = color.shape[:2]
     grid = Camera(width, height, camera.fx / STRIDE, camera.fy / STRIDE, camera.cx / STRIDE, camera.cy / STRIDE)
     if not neighbours:
         return DepthMap(reference.stamp, np.full((height, width), np.nan, np.float32), grid, color)
-    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
-    others, homographies, epipoles = [], [], []
+    gray = reference.picture.gray.astype(np.float32)
+    homographies, epipoles = [], []
     for neighbour in neighbours:
-        other, other_camera = working_image(neighbour.image, neighbour.camera, config.width)
-        others.append(np.asarray(cv2.cvtColor(other, cv2.COLOR_BGR2GRAY), np.uint8))
+        other = neighbour.picture.camera.matrix
         other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
-        homographies.append(other_camera.matrix @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
-        epipoles.append(other_camera.matrix @ other_from_reference[:3, 3])
+        homographies.append(other @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
+        epipoles.append(other @ other_from_reference[:3, 3])
     homography, epipole = np.stack(homographies), np.stack(epipoles)
     rolled = _at_width(reference.rolled, camera.width)
     rows = None if rolled is None else _rows(rolled, reference, neighbours)
     inverse = sweep(
-        cv2.pyrDown(_without_shading(gray)),
-        np.stack([_low_pass(_without_shading(other.astype(np.float32))) for other in others]),
+        census(cv2.pyrDown(_without_shading(gray)), 1),
+        np.stack([other.picture.codes for other in neighbours]),
         homography @ np.diag([STRIDE, STRIDE, 1.0]),
         epipole,
         (1.0 / far, 1.0 / near),
         None if rows is None else rows.thinned(STRIDE),
     )
-    inverse, correlation, sigma = refine(inverse, gray, np.stack(others), homography, epipole, STRIDE, rows)
+    others = np.stack([other.picture.fours for other in neighbours])
+    inverse, correlation, sigma = refine(inverse, gray, others, homography, epipole, STRIDE, rows)
     known = (correlation >= CORRELATION_MIN) & (sigma <= SIGMA_MAX)
     depth = np.where(known, 1.0 / np.where(known, inverse, 1.0), np.nan).astype(np.float32)
     if rolled is not None:
@@ -176,15 +204,6 @@ def _low_pass(image: FloatImage) -> FloatImage:
 
 def _centre(camera_from_world: FloatArray) -> FloatArray:
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-
-
-def working_image(image: ByteImage, camera: Camera, width: int) -> tuple[ByteImage, Camera]:
-    """(H, W, 3) image of a pinhole camera, reduced to `width` if it is wider."""
-    factor = width / camera.width
-    if factor >= 1.0:
-        return image, camera
-    camera = camera.scaled(factor)
-    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), camera
 
 
 def working_size(camera: Camera, width: int) -> tuple[int, int]:

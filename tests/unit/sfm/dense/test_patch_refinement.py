@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeprog_sfm.dense.patch_refinement import _fours, refine
+from pipeprog_sfm.dense.patch_refinement import fours, refine
 
 SHIFT = 4.0  # px between the views at inverse depth 1
 
@@ -14,8 +14,10 @@ def _refined(view: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """`refine` of a textured wall at inverse depth 1 with one view of it, from 1 % beside."""
     wall = np.random.default_rng(0).integers(0, 256, (48, 64), np.uint8)
     start = np.full((24, 32), 1.01, np.float32)
-    neighbours = (np.roll(wall, int(SHIFT), axis=1) if view is None else view)[None]
-    return refine(start, wall.astype(np.float32), neighbours, np.eye(3)[None], np.array([[SHIFT, 0.0, 0.0]]), 2)
+    neighbour = np.roll(wall, int(SHIFT), axis=1) if view is None else view
+    return refine(
+        start, wall.astype(np.float32), fours(neighbour)[None], np.eye(3)[None], np.array([[SHIFT, 0.0, 0.0]]), 2
+    )
 
 
 def test_a_flat_view_matches_nothing() -> None:
@@ -36,4 +38,4 @@ def test_a_textured_view_places_the_wall() -> None:
 
 def test_four_pixels_in_one() -> None:
     image = np.array([[1, 2], [3, 250]], np.uint8)
-    assert _fours(image)[0, 0] == 1 + (2 << 8) + (3 << 16) + (250 << 24)
+    assert fours(image)[0, 0] == 1 + (2 << 8) + (3 << 16) + (250 << 24)

@@ -13,7 +13,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import StereoConfig
-from pipeprog_sfm.dense.stereo import StereoImage, choose_pairs, depth_map
+from pipeprog_sfm.dense.stereo import Picture, StereoImage, choose_pairs, depth_map
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 WALL, AXIS, RADIUS = 2.0, 1.75, 0.15  # metres in front of the middle of the row; the pipe stands upright
@@ -67,7 +67,7 @@ def cast(camera_from_world, camera=CAMERA, motion=None):
 def view(stamp, camera_from_world, motion=None):
     gray = np.clip(texture(cast(camera_from_world, motion=motion)[1]), 0, 255).astype(np.uint8)
     rolled = None if motion is None else RolledImage(motion, CAMERA)
-    return StereoImage(stamp, np.repeat(gray[..., None], 3, axis=2), CAMERA, camera_from_world, rolled)
+    return StereoImage(stamp, Picture(np.repeat(gray[..., None], 3, axis=2), CAMERA), camera_from_world, rolled)
 
 
 LAYOUTS = {
@@ -82,7 +82,7 @@ def scene(request):
     centre, others, roll = LAYOUTS[request.param]
     reference = view(0, pose(centre, [0, 0, roll]))
     neighbours = [view(i + 1, pose(c, [0.02 * i, -0.1 * c[0], roll])) for i, c in enumerate(others)]
-    return reference, neighbours, depth_map(reference, neighbours, RANGE, CONFIG)
+    return reference, neighbours, depth_map(reference, neighbours, RANGE)
 
 
 def test_depth_lies_on_the_true_surfaces(scene):
@@ -110,7 +110,7 @@ def test_a_rolling_shutter_costs_no_depth(layout):
         view(i + 1, pose(c, [0.02 * i, -0.1 * c[0], 0.0]), motion)
         for i, (c, motion) in enumerate(zip(others, swaying, strict=True))
     ]
-    found = depth_map(reference, neighbours, RANGE, CONFIG)
+    found = depth_map(reference, neighbours, RANGE)
     depth, _, on_pipe = cast(reference.camera_from_world, found.camera)
     error = (found.depth - depth)[6:-6, 6:-6]
     wall, pipe = ~on_pipe[6:-6, 6:-6], on_pipe[6:-6, 6:-6]
@@ -119,13 +119,13 @@ def test_a_rolling_shutter_costs_no_depth(layout):
     assert np.isfinite(error[pipe]).mean() > 0.85
     assert np.nanmedian(np.abs(error[pipe])) < 0.006
     assert (np.abs(error[np.isfinite(error)]) > 0.05).mean() < 0.05
-    still = depth_map(replace(reference, rolled=None), neighbours, RANGE, CONFIG)
+    still = depth_map(replace(reference, rolled=None), neighbours, RANGE)
     assert np.nanmedian(np.abs(still.depth - depth)[6:-6, 6:-6][wall]) > 0.006
 
 
 def test_same_input_gives_the_same_bytes(scene):
     reference, neighbours, found = scene
-    assert depth_map(reference, neighbours, RANGE, CONFIG).depth.tobytes() == found.depth.tobytes()
+    assert depth_map(reference, neighbours, RANGE).depth.tobytes() == found.depth.tobytes()
 
 
 def test_unit_of_length_does_not_matter(scene):
@@ -134,9 +134,9 @@ def test_unit_of_length_does_not_matter(scene):
     def scaled(image):
         matrix = image.camera_from_world.copy()
         matrix[:3, 3] *= 8.0  # a power of two: exact
-        return StereoImage(image.stamp, image.image, image.camera, matrix)
+        return StereoImage(image.stamp, image.picture, matrix)
 
-    far = depth_map(scaled(reference), [scaled(n) for n in neighbours], (8 * RANGE[0], 8 * RANGE[1]), CONFIG)
+    far = depth_map(scaled(reference), [scaled(n) for n in neighbours], (8 * RANGE[0], 8 * RANGE[1]))
     both = np.isfinite(far.depth) & np.isfinite(found.depth)
     assert both.mean() > 0.99 * np.isfinite(found.depth).mean()
     np.testing.assert_allclose(far.depth[both], 8 * found.depth[both], rtol=2e-3)
@@ -145,30 +145,33 @@ def test_unit_of_length_does_not_matter(scene):
 def test_wrong_depth_range_is_refused(scene):
     reference, neighbours, _ = scene
     with pytest.raises(ValueError, match="depth range"):
-        depth_map(reference, neighbours, (2.0, 1.0), CONFIG)
+        depth_map(reference, neighbours, (2.0, 1.0))
 
 
 def test_one_neighbour_is_enough_and_none_gives_nothing(scene):
     reference, neighbours, _ = scene
-    single = depth_map(reference, neighbours[:1], RANGE, CONFIG)
+    single = depth_map(reference, neighbours[:1], RANGE)
     error = single.depth - cast(reference.camera_from_world, single.camera)[0]
     assert np.isfinite(error).mean() > 0.5
     assert np.nanmedian(np.abs(error)) < 0.006
-    assert not np.isfinite(depth_map(reference, [], RANGE, CONFIG).depth).any()
+    assert not np.isfinite(depth_map(reference, [], RANGE).depth).any()
 
 
 def test_bare_surface_has_no_depth():
     noise = np.random.default_rng(0)
     images = [
-        StereoImage(i, noise.integers(126, 130, (240, 320, 3)).astype(np.uint8), CAMERA, pose([0.15 * i, 0, 0]))
+        StereoImage(
+            i, Picture(noise.integers(126, 130, (240, 320, 3)).astype(np.uint8), CAMERA), pose([0.15 * i, 0, 0])
+        )
         for i in range(3)
     ]
-    assert np.isfinite(depth_map(images[0], images[1:], RANGE, CONFIG).depth).mean() < 0.1  # matches by chance
+    assert np.isfinite(depth_map(images[0], images[1:], RANGE).depth).mean() < 0.1  # matches by chance
 
 
 def test_working_width_bounds_the_map():
     reference, other = view(0, pose([0, 0, 0])), view(1, pose([0.3, 0, 0]))
-    found = depth_map(reference, [other], RANGE, StereoConfig(width=160))
+    reduced = [replace(each, picture=Picture.reduced(each.picture.color, CAMERA, 160)) for each in (reference, other)]
+    found = depth_map(reduced[0], reduced[1:], RANGE)
     assert found.depth.shape == found.color.shape[:2] == (60, 80) == (found.camera.height, found.camera.width)
     # halved with aligned pixel areas (2 u + 0.5), then every second centre (2 u)
     np.testing.assert_allclose([2 * 2 * found.camera.cx + 0.5, 4 * found.camera.fx], [CAMERA.cx, CAMERA.fx])
