@@ -46,9 +46,8 @@ def killed_survey(graph: LiveGraph, robot: Robot, name: str, victim: tuple[str, 
 
     answer = robot.survey(name, strike)
     return {
-        "killed": " ".join((victim[0], "worker" * victim[1])).strip(),
-        "moment [s]": round(moment, 1),
-        "stage": at[0] if at else "over",
+        **({"killed": " ".join((victim[0], "worker" * victim[1])).strip()} if at else {}),
+        **({"moment [s]": round(moment, 1), "stage": at[0]} if at else {}),
         "status": int(answer.status),
         "error_code": int(answer.result.error_code),
         "error_msg": answer.result.error_msg,
