@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_BILL_COLUMNS, MAX_BILL_ROWS, MAX_TEXT, MAX_YAML
 from pipeprog_camera.text_file import read_text
-from pipeprog_detect.plan.bill_table import table_entries
+from pipeprog_detect.plan.bill_table import heading_row, table_entries
 from pipeprog_detect.plan.entry import Entry
 
 _SEPARATORS = (";", "\t", ",")  # a decimal comma stands beside semicolons or tabs: these are looked for first
@@ -35,4 +36,25 @@ def csv_entries(path: Path) -> list[Entry]:
             rows.append([cell[:MAX_TEXT].replace("\u202f", " ").replace("\u00a0", " ") for cell in row])
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV ({error}): write the file again") from None
+    _refuse_parted_numbers(path, rows)
     return table_entries(str(path), rows)
+
+
+def _refuse_parted_numbers(path: Path, rows: Sequence[Sequence[str]]) -> None:
+    """Raises InputError for a row with cells beyond the headings, such as `A,8,6,2,4` where 8,6 and 2,4 are meant."""
+    top = heading_row(rows)
+    if top is None:
+        return
+    headings = len(_filled(rows[top]))
+    for number, row in enumerate(rows[top + 1 :], top + 2):
+        if len(_filled(row)) > headings:
+            raise InputError(
+                f"{path}, row {number}: {len(_filled(row))} cells under {headings} headings: write decimals with a "
+                "point, or part the columns by semicolons; give remarks a heading"
+            )
+
+
+def _filled(row: Sequence[str]) -> Sequence[str]:
+    """A row without the empty cells at its end."""
+    last = max((number for number, cell in enumerate(row) if cell.strip()), default=-1)
+    return row[: last + 1]

@@ -139,6 +139,7 @@ def test_lines_of_one_size_are_one_class_that_knows_them(planned: Any) -> None:
         ),
         ("name;diameter [mm];length [m]\nA;60;1.906\n", "is '1.906' 1906, or 1.906 with three decimals?"),
         ("name;diameter [mm];length [m]\nA;60,3;8.5\n", "8.5' has a decimal point, and"),
+        ("name,diameter [mm],length [m]\nA,17,2,2,4\n", "row 2: 5 cells under 3 headings: write decimals with a point"),
         ('name;diameter [mm];length [m]\n"A;60\n', "is no CSV"),
         ("name,size,length [m],start\nA,DN50 steel,3,03/01/2026\n", "write the date as YYYY-MM-DD"),
         ("name,size,length [m],start,finish\nA,DN50 steel,3,2026-05-01,2026-04-01\n", "lies before start 2026-05-01"),
