@@ -73,17 +73,17 @@ def calibrate(request: Request, report: Callable[[float, str], None]) -> Calibra
     boards = load_board_file(request.board).boards
     if not boards:
         raise InputError(f"{request.board} has no board: give a file with `boards`, such as boards/a4.yaml")
-    is_recording = request.source.is_dir() or request.source.suffix in _RECORDINGS
-    start, is_guess, film = (_recorded if is_recording else _filmed)(request)
-    if not film:
-        raise InputError(f"{request.source} has no image that can be read: film the board again")
-    try:
-        found = calibrate_film(
-            film, boards[0], start, is_guess, lambda share, stage: report(_READING + (1 - _READING) * share, stage)
-        )
-    except InputError as error:
-        raise InputError(f"{request.source}: {error}") from None
     with output_file(request.out, request.force) as temporary:
+        is_recording = request.source.is_dir() or request.source.suffix in _RECORDINGS
+        start, is_guess, film = (_recorded if is_recording else _filmed)(request)
+        if not film:
+            raise InputError(f"{request.source} has no image that can be read: film the board again")
+        try:
+            found = calibrate_film(
+                film, boards[0], start, is_guess, lambda share, stage: report(_READING + (1 - _READING) * share, stage)
+            )
+        except InputError as error:
+            raise InputError(f"{request.source}: {error}") from None
         comments = [f"calibrated by `pipeprog calibrate` in {found.views} images", *summary(found), *found.advice()]
         temporary.write_text(camera_file_text(found.camera, found.readout, comments), encoding="utf-8")
     return found

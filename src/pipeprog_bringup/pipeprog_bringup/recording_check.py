@@ -84,7 +84,7 @@ def check(bag: Bag, board_file: BoardFile, size: int) -> Findings:
     if board_file.boards and samples and not any(seen.values()):
         text = f"no board was seen in {len(samples)} frames of {len(stamps)}"
         if SCALE_TOPICS & set(motion) or len(samples) < len(stamps):
-            findings.notes.append(f"{text}: is it the right file, and does the film show the board from 1 to 3 m?")
+            findings.notes.append(f"{text}: is it the right file, and is the board in view, near, sharp and lit?")
         else:
             findings.faults.append(f"{text}, and nothing else tells the scale: film the board, or name its file")
     if blurred > len(samples) / 3:

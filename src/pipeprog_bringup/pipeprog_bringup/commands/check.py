@@ -58,6 +58,8 @@ def check(
             note(sentence)
         for sentence in findings.faults:
             fail(sentence)
+        if not findings.faults and not findings.notes:
+            say("nothing is lacking")
     if findings.faults:
         raise typer.Exit(1)
 

@@ -69,9 +69,15 @@ def export(
     Coordinates are those of the map, or of the site that `alignment` leads to. Raises InputError where the folder holds
     no results, a format is not known or needs what is not installed, or a file exists and `force` is not set.
     """
+    names = [name.lower() for name in names]
     for name in names:
+        if name == "pdf":
+            raise InputError("--to pdf: `pipeprog report DIR --pdf` writes the report for paper")
         if name not in FORMATS:
-            raise InputError(f"--to {shown(name)}: no such format: did you mean '{nearest(name, FORMATS)}'?")
+            raise InputError(
+                f"--to {shown(name)}: no such format: did you mean '{nearest(name, FORMATS)}'? "
+                f"There are {', '.join(FORMATS)}"
+            )
     survey = Survey(read_results(folder), Site() if alignment is None else alignment.site)
     written = []
     for name in dict.fromkeys(names):

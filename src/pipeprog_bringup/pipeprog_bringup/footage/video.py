@@ -25,6 +25,7 @@ from pipeprog_camera.limits import MAX_VIDEO_SECONDS
 _ERRORS = 2  # OpenCV's number for messages of errors alone
 # Containers that cameras write; FFmpeg's names.
 _CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg,mxf,mjpeg,h264,hevc"
+_PICTURES = (".jpg", ".jpeg", ".png", ".heic")
 _HUFFMAN_TABLES = b"\xff\xc4"  # which some cameras leave out of their motion JPEG
 
 
@@ -129,7 +130,12 @@ def _open(video: Path) -> Any:
     os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = f"protocol_whitelist;file|format_whitelist;{_CONTAINERS}"
     capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     if not capture.isOpened():
-        raise InputError(f"{video} is no video that can be read: convert it to H.264 in an .mp4 file")
+        if video.suffix.lower() in _PICTURES:
+            raise InputError(f"{video} is a picture: give a video, or the folder of the pictures")
+        raise InputError(
+            f"{video} is no video that can be read: copy it again where it may be cut off, or convert it to H.264 in "
+            "an .mp4 file"
+        )
     return capture
 
 

@@ -130,6 +130,8 @@ def read_results(folder: str | Path) -> Results:
     Raises InputError, naming the file and the remedy, where it is no such folder or a file in it is damaged.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder} is a file: give the folder that `pipeprog replay` or `pipeprog detect` has written")
     if not folder.is_dir():
         raise InputError(f"no such folder: {folder}")
     if not (folder / "pipes.json").is_file():

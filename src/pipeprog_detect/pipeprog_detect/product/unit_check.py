@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from pipeprog_detect.product.standard_sizes import SIZES
 _THINNEST_MM = 3.0
 # Of a diameter: manufacturing tolerance (EN 10220: 1 %, at least 0.5 mm) and rounding to a tenth of a millimetre.
 _RELATIVE, _LEAST_MM = 0.01, 0.15
+_NOMINAL = re.compile(r"\bDN ?(\d+)\b", re.IGNORECASE)
 _STANDARD_MM = sorted({1e3 * size.outer_diameter for size in SIZES.values()})
 
 
@@ -43,8 +45,12 @@ _READINGS: tuple[tuple[str, Callable[[WrittenSize], float]], ...] = (
 def ask_about_units(sizes: Sequence[WrittenSize]) -> None:
     """Raises InputError with a question where no size is one as it is written.
 
-    That is where a pipe is thinner than any, or no size is a standard one and all are, taken for something else.
+    That is where a pipe is thinner than any, where no size is a standard one and all are, taken for something else, or
+    where a radius is the diameter that the class's own name has.
     """
+    twice = next((size for size in sizes if _is_diameter_of_its_name(size)), None)
+    if twice is not None:
+        raise InputError(_question(twice, "diameters", twice.number))
     thin = [size for size in sizes if size.diameter_mm < _THINNEST_MM]
     if not sizes or (not thin and any(_is_standard(size.diameter_mm) for size in sizes)):
         return
@@ -70,6 +76,15 @@ def _question(size: WrittenSize, reading: str, diameter_mm: float) -> str:
         f"{size.where}: class {shown(size.name)}: {size.key} is {size.number:g}: are these {reading}? "
         f"Then write {key}: {number:g}{unless}"
     )
+
+
+def _is_diameter_of_its_name(size: WrittenSize) -> bool:
+    """Whether a radius, such as 114.3 of `DN100`, is the outer diameter of the nominal size in the name."""
+    found = _NOMINAL.search(size.name)
+    if size.key != "outer_radius_mm" or found is None:
+        return False
+    named = [SIZES[name] for kind in ("steel", "PVC") if (name := f"DN{found[1]} {kind}") in SIZES]
+    return any(abs(size.number - 1e3 * one.outer_diameter) <= _LEAST_MM for one in named)
 
 
 def _is_standard(diameter_mm: float) -> bool:

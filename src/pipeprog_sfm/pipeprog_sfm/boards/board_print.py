@@ -37,9 +37,10 @@ def board_pdf(boards: Sequence[Board], paper: str) -> bytes:
     Raises:
         InputError: the paper is unknown, or a board does not fit on it (the text names one that it fits on).
     """
-    if paper not in PAPERS:
+    size = next((name for name in PAPERS if name.lower() == paper.lower()), None)
+    if size is None:
         raise InputError(f"paper '{paper}' is unknown: use one of {', '.join(PAPERS)}")
-    return _document([_page(board, paper) for board in boards])
+    return _document([_page(board, size) for board in boards])
 
 
 def _plate(board: Board) -> tuple[float, float, float, float]:

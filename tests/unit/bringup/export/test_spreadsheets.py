@@ -101,10 +101,12 @@ def test_files_are_not_replaced_without_a_word(folder: Path, tmp_path: Path) -> 
     export(folder, ["csv"], tmp_path / "out")
     with pytest.raises(InputError, match=r"classes\.csv exists: .*--force"):
         export(folder, ["csv"], tmp_path / "out")
-    export(folder, ["csv"], tmp_path / "out", force=True)
+    export(folder, ["CSV"], tmp_path / "out", force=True)
 
 
 def test_an_unknown_format_is_told_with_the_nearest(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--to 'xslx': no such format: did you mean 'xlsx'"):
         export(folder, ["xslx"], tmp_path / "out")
+    with pytest.raises(InputError, match="`pipeprog report DIR --pdf`"):
+        export(folder, ["pdf"], tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -122,6 +122,9 @@ def test_what_is_no_scan(tmp_path: Path) -> None:
         run(tmp_path / "folder")
     with pytest.raises(InputError, match=r"v\.mp4 is no video that can be read"):
         run(tmp_path / "v.mp4")
+    (tmp_path / "p.JPG").write_bytes(b"")
+    with pytest.raises(InputError, match=r"p\.JPG is a picture: give a video, or the folder of the pictures"):
+        run(tmp_path / "p.JPG")
 
 
 HOSTILE_ROWS = {

@@ -68,3 +68,17 @@ def test_decimal_commas_in_yaml_are_recognised(tmp_path: Path, text: str, told: 
     with pytest.raises(InputError, match="class 'a'") as caught:
         load_boq(path)
     assert told in str(caught.value)
+
+
+def test_one_diameter_among_radii_is_asked_about(tmp_path: Path) -> None:
+    """The others are right, and a radius of 114.3 mm is that of DN225; but this class says that it is DN100."""
+    path = tmp_path / "boq.yaml"
+    rows = """
+  - {{name: DN65, outer_radius_mm: 38.05, planned_length_m: 3}}
+  - {{name: {}, outer_radius_mm: 114.3, planned_length_m: 3}}
+"""
+    path.write_text("classes:" + rows.format("cold water DN100"))
+    with pytest.raises(InputError, match=r"are these diameters\? Then write outer_diameter_mm: 114\.3"):
+        load_boq(path)
+    path.write_text("classes:" + rows.format("DN225"))
+    assert len(load_boq(path).classes) == 2
