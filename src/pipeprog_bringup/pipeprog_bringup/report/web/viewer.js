@@ -121,9 +121,9 @@ for (const [name, object] of Object.entries(layers)) {
 
 // ---- where the camera stands
 const ends = pipes.flatMap((pipe) => [new THREE.Vector3(...pipe.start), new THREE.Vector3(...pipe.end)]);
-const region = new THREE.Box3().setFromPoints(ends.length ? ends : cameras.map((pose) => new THREE.Vector3(pose[3], pose[7], pose[11])));
-const centre = region.getCenter(new THREE.Vector3());
-const size = region.getSize(new THREE.Vector3());
+const edges = boards.flatMap(({lines}) => lines[0].map((corner) => new THREE.Vector3(...corner)));
+const wanted = ends.length ? [...ends, ...edges] : cameras.map((pose) => new THREE.Vector3(pose[3], pose[7], pose[11]));
+const centre = new THREE.Box3().setFromPoints(wanted).getCenter(new THREE.Vector3());
 function home() {
   const eye = new THREE.Vector3(0.4, -1, 0.35);
   if (cameras.length) {
@@ -133,9 +133,15 @@ function home() {
     if (mean.length() > 0.1) eye.copy(mean.normalize()).setZ(0.35);
   }
   controls.target.copy(centre);
-  const wide = Math.max(Math.hypot(size.x, size.y), 1), half = Math.tan(camera.fov / 2 * Math.PI / 180);
-  const distance = 0.55 * Math.max(wide / (half * camera.aspect), Math.max(size.z, 1) / half) + 0.25 * Math.min(size.x, size.y);
-  camera.position.copy(centre).addScaledVector(eye.normalize(), distance);
+  // As near as all that is wanted stays in view, with a margin of a tenth, but no nearer than a metre.
+  eye.normalize();
+  const half = Math.tan(camera.fov / 2 * Math.PI / 180) / 1.1;
+  const right = new THREE.Vector3().crossVectors(camera.up, eye).normalize(), up = new THREE.Vector3().crossVectors(eye, right);
+  const distance = Math.max(1, ...wanted.map((point) => {
+    const from = point.clone().sub(centre);
+    return from.dot(eye) + Math.max(Math.abs(from.dot(right)) / camera.aspect, Math.abs(from.dot(up))) / half;
+  }));
+  camera.position.copy(centre).addScaledVector(eye, distance);
   controls.update();
 }
 
