@@ -120,7 +120,7 @@ def summary(surveys: Sequence[Survey], step: Step | None = None, not_compared: s
         sigma=_joined_sigma(rows, newest.scale.get("sigma")),
         change=sum(changes) if changes else None,
         days=days,
-        previous="" if previous is None else f"{previous.time:%Y-%m-%d}",
+        previous="" if previous is None else _when(previous, newest),
         rows=rows,
         unplanned=(len(unplanned), sum(unplanned)),
         lines=bill,
@@ -206,6 +206,12 @@ def _seen(survey: Survey) -> str:
         f"{range_of} % of the {survey.results.walls_m2:.0f} m² of walls that were found was seen well enough; "
         "the plan has no places, so metres that were not seen cannot be told"
     )
+
+
+def _when(previous: Survey, newest: Survey) -> str:
+    """The day of the survey before, and the time where both are of one day."""
+    is_same_day = previous.time.date() == newest.time.date()
+    return f"{previous.time:%Y-%m-%d %H:%M}" if is_same_day else f"{previous.time:%Y-%m-%d}"
 
 
 def _joined_sigma(rows: Sequence[ClassRow], scale_sigma: float | None) -> float | None:
