@@ -157,8 +157,6 @@ class Mapper:
         """Tries the waiting keyframes once more and adjusts everything."""
         for model in self.map.models:
             self.map.adjust_globally(model)
-            if self.map.readout:
-                self.map.release_starters(model)
         while self.map.waiting:
             before = len(self.map.waiting)
             self._retry(list(self.map.waiting))

@@ -16,7 +16,7 @@ from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_points, pose_covariance
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
 from pipeprog_sfm.sparse.registration import rejection_reason
-from pipeprog_sfm.sparse.row_motion import NEAR, row_motions, unroll
+from pipeprog_sfm.sparse.row_motion import row_motions, unroll
 from pipeprog_sfm.sparse.self_calibration import RADII, radial_residuals
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
@@ -99,16 +99,6 @@ class SparseMap:
                 self.remove_view(model, view)
         model.adjusted_at = len(model)
         self.revision += 1
-
-    def release_starters(self, model: SparseModel) -> None:
-        """With a rolling shutter: the views that started a model wait to be registered by what the others see.
-
-        Nothing told their velocities then, so that a false pose of both can agree, and no matches contradict it later.
-        """
-        if len(model) > NEAR:
-            for stamp in [stamp for stamp in model.stamps if stamp not in self.matches]:
-                self.remove_view(model, model.stamps.index(stamp))
-                self.waiting.append(stamp)
 
     def replace_camera(self, told: Camera, camera: Camera) -> None:
         """Gives all keyframes of one calibration another one, or the same; points and poses are adjusted."""

@@ -14,7 +14,6 @@ from scenes import CAMERA, STEP, pose, position_errors, view
 
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
-from pipeprog_sfm.sparse import sparse_map
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.self_calibration import Priors
 
@@ -81,19 +80,6 @@ def test_a_trajectory_faster_than_the_keyframes_is_told_by_the_rows() -> None:
     assert list(poses) == sorted(truth)
     # Three keyframes a step: the spline alone is off by 7.7 mm. With a global shutter: 0.4 mm.
     assert position_errors(poses, truth).max() < 2.5e-3
-
-
-def test_the_views_that_started_a_model_are_registered_by_the_others(
-    told: tuple[Mapper, dict[int, NDArray[Any]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mapper, truth = copy.deepcopy(told)
-    monkeypatch.setattr(sparse_map, "NEAR", 4)  # of nine views
-    assert len(set(truth) - set(mapper.map.matches)) == 2
-    mapper.finish()
-    poses = mapper.map.camera_from_model()
-    assert list(poses) == sorted(truth)
-    assert set(mapper.map.matches) == set(truth)  # what a false pose is rejected by
-    assert position_errors(poses, truth).max() < 2e-3
 
 
 @pytest.fixture(scope="module")
