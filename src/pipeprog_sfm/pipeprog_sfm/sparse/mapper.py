@@ -20,7 +20,7 @@ from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, rejection_reason
-from pipeprog_sfm.sparse.row_motion import predicted, row_motions, unroll
+from pipeprog_sfm.sparse.row_motion import predicted, row_motions
 from pipeprog_sfm.sparse.self_calibration import Priors, Refinement, refine
 from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -128,18 +128,10 @@ class Mapper:
 
     def self_calibration(self, told: Priors) -> Refinement | None:
         """The camera that the published model agrees with best; None where that is not known, or of several cameras."""
-        model, keyframes = self.map.published, self.map.keyframes
-        if len({keyframes[stamp].camera for stamp in model.stamps}) != 1:
-            return None
-        if not told.sigmas[3] > 0:
-            return refine(model, keyframes, told, {})
-        # Velocities that were fitted to rows hide that the read-out with which they were is wrong.
-        motions = row_motions(model, keyframes, self.map.readout, by_rows=False)
-        if self.map.readout:
-            unroll(model, keyframes, motions)
-        found = refine(model, keyframes, told, motions)
-        unroll(model, keyframes, self.map.motions(model))
-        return found
+        model = self.map.published
+        cameras = {self.map.keyframes[stamp].camera for stamp in model.stamps}
+        motions = row_motions(model, self.map.keyframes, self.map.readout) if told.sigmas[3] > 0 else {}
+        return refine(model, self.map.keyframes, told, motions) if len(cameras) == 1 else None
 
     def take_camera(self, refinement: Refinement) -> None:
         """Goes on with a refined camera: the published model has its poses, all else is adjusted to it."""

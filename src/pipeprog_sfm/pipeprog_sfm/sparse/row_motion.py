@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rolling shutter of a sparse model: how each view moves, and its features where the middle row's camera has them.
 
-The velocities are those of a spline through the poses of the views, corrected by what a view's own rows tell as far as
-the spline may be off: hardly where the trajectory is smooth between the views, more at its ends and in sharp turns.
-Velocities that are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in
-one direction (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds).
+The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
+are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
+(Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). The ends of the
+trajectory, where a spline is poor, are corrected by what their own rows tell.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
@@ -33,11 +33,10 @@ from pipeprog_sfm.sparse.sparse_model import SparseModel
 MAX_GAP = 1.0  # s between two views that still tell the velocity between them: a hand sways at 1 to 2 Hz
 MIN_GAP = 0.02  # s between two knots: poses are known to 0.3 mm, and their difference over it to 0.02 m/s
 NEAR = 16  # views nearest in time that tell how one moves: a knot has a quarter of the say of the one before
+# rad/s and depths of the scene per second, for each second to the next pose: how far the velocity at an end of the
+# spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
+END_CHANGE = 1.0
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
-LEAST_SIGMA = 1e-6  # rad/s, and model units per second, below any motion: keeps the equations solvable
-# Views beside its own that a point must be seen by to tell a velocity: with fewer it follows the errors of the pose,
-# and the first views of a model bend it.
-OTHERS = 3
 MIN_POINTS = 50  # of a view, from which its own rows tell its velocity: twelve unknowns, and some wrong points
 
 
@@ -47,13 +46,11 @@ def row_motions(
     readout: float,
     near: IntArray | None = None,
     count: int | None = None,
-    by_rows: bool = True,
 ) -> dict[int, RowMotion]:
     """How the model moves as seen from its views, by stamp; left out where it is unknown.
 
     Lengths are in the unit of the model. Each camera of a rig has a trajectory of its own. With `near`, the trajectory
-    is that of these views alone, and the motions are those of the first `count` of them. Without `by_rows` the motions
-    are those of the spline alone, which know nothing of the read-out.
+    is that of these views alone, and the motions are those of the first `count` of them.
     """
     views = np.arange(len(model)) if near is None else near
     wanted = set(views[:count].tolist())
@@ -69,12 +66,17 @@ def row_motions(
         ends = np.flatnonzero(np.diff(stamps) > MAX_GAP * 1e9) + 1
         for part in np.split(order, ends):
             own = [model.stamps[view] for view in part]
-            motions = _spline_motions(own, model.rotation[part], centres[part])
-            for view, stamp, linear, angular, sigmas in zip(part.tolist(), own, *motions, strict=False):
-                if view in wanted:
-                    keyframe = keyframes[stamp]
-                    motion = RowMotion(readout, keyframe.camera.height, linear, angular)
-                    found[stamp] = _fitted(model, view, keyframe, motion, sigmas) if by_rows else motion
+            linear, angular = _velocities(own, model.rotation[part], centres[part])
+            gaps = np.diff(own, prepend=own[0], append=own[-1]) * 1e-9
+            for number, (shift, turn) in enumerate(zip(linear, angular, strict=True)):
+                if part[number] not in wanted:
+                    continue
+                keyframe = keyframes[own[number]]
+                motion = RowMotion(readout, keyframe.camera.height, shift, turn)
+                if number in (0, len(own) - 1):
+                    sigma = END_CHANGE * max(gaps[number], gaps[number + 1])
+                    motion = _fitted(model, int(part[number]), keyframe, motion, sigma)
+                found[own[number]] = motion
     return found
 
 
@@ -157,16 +159,14 @@ def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatAr
     return np.asarray(depths[depths > 0][tree.query(keyframe.measured)[1]])
 
 
-def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion, sigmas: FloatArray) -> RowMotion:
+def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion, sigma: float) -> RowMotion:
     """The motion that fits the view's points best, with that of the spline as the prior and the pose as it may be.
 
-    sigmas (2,): standard deviations of the prior's linear and angular velocity. One Gauss-Newton step for pose and
-    velocity, twelve unknowns: the columns of the velocity are those of the pose times the row's time.
+    sigma: standard deviation of the spline's velocities, rad/s, and depths of the scene per second. One Gauss-Newton
+    step for pose and velocity, twelve unknowns: the columns of the velocity are those of the pose times the row's time.
     """
-    own = model.point_of[model.features(view)]
-    views = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points))
-    features = np.flatnonzero((own >= 0) & (views[own] > OTHERS))
-    inside = model.points[own[features]] @ model.rotation[view].T
+    features = np.flatnonzero(model.point_of[model.features(view)] >= 0)
+    inside = model.points[model.point_of[model.features(view)][features]] @ model.rotation[view].T
     inside += model.translation[view]
     ahead = inside[:, 2] > 0
     features, inside = features[ahead], inside[ahead]
@@ -185,36 +185,28 @@ def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion
     rows = np.concatenate([by_pose, times * by_pose], axis=2)
     weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * model.noise) ** 2) / model.noise**2
     normal = np.einsum("n,nij,nik->jk", weights, rows, rows)
-    normal[np.arange(6, 12), np.arange(6, 12)] += 1.0 / np.repeat(np.maximum(sigmas[::-1], LEAST_SIGMA), 3) ** 2
+    depth = float(np.median(z))
+    normal[np.arange(6, 12), np.arange(6, 12)] += 1.0 / (sigma * np.repeat([1.0, depth], 3)) ** 2
     change = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weights, rows, error))[6:]
     return replace(motion, angular=motion.angular + change[:3], linear=motion.linear + change[3:])
 
 
-def _spline_motions(
-    stamps: list[int], rotations: FloatArray, centres: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _velocities(stamps: list[int], rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(V, 3) linear and (V, 3) angular velocities of the model as seen from cameras at ascending stamps, ns.
-
-    And the (V, 2) standard deviations of both, rad/s and model units per second: how far those of a spline and those
-    of a parabola through the neighbours are apart, divided among three axes. A spline through a sway that the poses
-    resolve is better than that, one through a sharp turn is not.
 
     Empty for one view. rotations (V, 3, 3) camera_from_model, centres (V, 3).
     """
     times = (np.array(stamps) - stamps[0]) * 1e-9
     knots = _apart(times)
     if len(knots) < 2:
-        return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2))
+        return np.empty((0, 3)), np.empty((0, 3))
     turns = _unit_quaternions(rotations.transpose(0, 2, 1))
-    places = np.c_[centres, turns]
     # Without acceleration at the ends: a spline whose ends are free doubles the error of its last velocities.
-    rate = CubicSpline(times[knots], places[knots], bc_type="natural")(times, 1)
+    spline = CubicSpline(times[knots], np.c_[centres, turns][knots], bc_type="natural")
+    rate = spline(times, 1)
     # q' = q w / 2 with the angular velocity w in the camera's frame; what is along q changes its length alone.
     own_turn = 2.0 * (Rotation.from_quat(turns).inv().as_matrix() @ _imaginary(turns, rate[:, 3:])[..., None])[..., 0]
-    apart = rate[knots] - np.gradient(places[knots], times[knots], axis=0)
-    apart = apart[np.searchsorted(times[knots], times, side="right") - 1]
-    sigmas = np.c_[np.linalg.norm(apart[:, :3], axis=1), 2.0 * np.linalg.norm(apart[:, 3:], axis=1)] / np.sqrt(3.0)
-    return -np.einsum("vij,vj->vi", rotations, rate[:, :3]), -own_turn, sigmas
+    return -np.einsum("vij,vj->vi", rotations, rate[:, :3]), -own_turn
 
 
 def _unit_quaternions(rotations: FloatArray) -> FloatArray:

@@ -119,11 +119,10 @@ class SparseMap:
     def motions(self, model: SparseModel, readout: float | None = None) -> dict[int, RowMotion]:
         """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout.
 
-        readout: s, another one than the map's, for which nothing has been fitted to rows yet.
+        readout: s, another one than the map's.
         """
-        if readout is None:
-            return row_motions(model, self.keyframes, self.readout) if self.readout else {}
-        return row_motions(model, self.keyframes, readout, by_rows=False) if readout else {}
+        readout = self.readout if readout is None else readout
+        return row_motions(model, self.keyframes, readout) if readout else {}
 
     def _adjust_rolling(self, model: SparseModel) -> None:
         """Finds the shifts of features and the poses in turns, until the shifts stay."""
