@@ -16,6 +16,7 @@ import json
 import random
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,20 @@ def _is_same(one: Pipe, other: Pipe) -> bool:
     return bool(one.class_name == other.class_name and abs(along @ across) > PARALLEL and near)
 
 
+def figures(alone: dict[str, Any], killed: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
+    """The result as a page shows it: one row a survey, the one that was left alone first."""
+    ended = sum(each["status"] == GoalStatus.STATUS_SUCCEEDED for each in killed)
+    shown = ("killed", "moment [s]", "stage", "seconds", "keyframes", "registered", "kept")
+    rows = [{**{key: each.get(key, "-") for key in shown}, "pipes": len(each["pipes"])} for each in (alone, *killed)]
+    return {
+        "title": "Nodes killed during live surveys",
+        "command": f"python -m benchmarks.node_kills --kills {len(killed)} --seed {seed}",
+        "commit": commit(),
+        "ended with a result": f"{ended} of {len(killed)}",
+        "rows": rows,
+    }
+
+
 def main() -> None:
     """Measures and writes."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.node_kills", description=__doc__)
@@ -98,10 +113,8 @@ def main() -> None:
                 row["kept"] = f"{kept(pipes, answer.result.pipes.pipes)} of {len(pipes)}"
                 rows.append(row)
                 print(json.dumps(row), flush=True)
-                ended = sum(each["status"] == GoalStatus.STATUS_SUCCEEDED for each in rows)
-                figures = {"commit": commit(), "seed": options.seed, "ended with a result": f"{ended} of {len(rows)}"}
                 (RESULTS / "node_kills.json").write_text(
-                    json.dumps({**figures, "alone": alone, "surveys": rows}, indent=1) + "\n"
+                    json.dumps(figures(alone, rows, options.seed), indent=1) + "\n"
                 )
 
 

@@ -77,8 +77,8 @@ ADVICE = {
         "This table is of 0.75 m/s and was measured before read-outs were taken from the images.\n"
         "Since then, another lab (seed 3, 720p, 5 Hz), not told: 15 ms 6 of 6 with a radius RMSE of 0.105 mm and a "
         "scale 0.003 % off; 30 ms 6 of 6 with 0.085 mm.\n"
-        "Seed 41, 15 ms: not told 6 of 6 with 0.093 mm, a scale 0.074 % off and a read-out of 15.4 ms; told 6 of 6 with "
-        "0.093 mm and a scale 0.003 % off.",
+        "Seed 41, 15 ms: not told 6 of 6 with 0.093 mm, a scale 0.074 % off and a read-out of 15.4 ms; told 6 of 6 "
+        "with 0.093 mm and a scale 0.003 % off.",
     ),
 }
 COLUMNS = ("right class", "false", "F", "radius RMSE [mm]", "length error [%]", "scale error [%]")
