@@ -32,10 +32,11 @@ def survey(task: Task, scratch: Path, runner: Runner, watcher: Watcher) -> Outco
         fetched = time.monotonic()
         # Reading a large recording takes minutes: not where nothing is there to compare it with.
         earlier = _whole_results(place, task)
-        if earlier and earlier["fleet"].get("digest") == fingerprint.digest(task, recording):
+        state = fingerprint.state(recording)
+        digest = fingerprint.digest(task, recording) if earlier else ""
+        if earlier and earlier["fleet"].get("digest") == digest:
             _keep(place, task, earlier)
             return Outcome(task.name, "kept")
-        state = fingerprint.state(recording)
         (scratch / f"boq{task.boq_kind}").write_bytes(task.boq)
         if task.board:
             (scratch / "board.yaml").write_bytes(task.board)
@@ -48,7 +49,8 @@ def survey(task: Task, scratch: Path, runner: Runner, watcher: Watcher) -> Outco
     surveyed = time.monotonic()
     facts = {**facts, "host": socket.gethostname(), "fetch_s": round(fetched - started, 3)}
     # Of a recording that was still written to, nobody knows what was surveyed: the next call does it again.
-    digest = fingerprint.digest(task, recording) if fingerprint.state(recording) == state else ""
+    is_unchanged = fingerprint.state(recording) == state
+    digest = (digest or fingerprint.digest(task, recording)) if is_unchanged else ""
     _publish(place, task, scratch / "results", {"digest": digest, **facts}, surveyed)
     return Outcome(task.name, "done", facts={**facts, "store_s": round(time.monotonic() - surveyed, 3)})
 
