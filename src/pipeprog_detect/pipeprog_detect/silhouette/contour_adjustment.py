@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
-from pipeprog_detect.silhouette.edge_support import hits, support_profile
+from pipeprog_detect.silhouette.edge_support import COMMON, HIT_RATE, TEXTURE, hits, support_profile
 from pipeprog_detect.silhouette.limb_edges import LimbEdges
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
@@ -46,6 +46,7 @@ class AdjustedCylinder:
         covariance: (5, 5) of the step [m^2].
         used: mask (N,) of the samples of which an edge counted.
         share: support (0 to 1) of its contour.
+        log_odds: logarithm of how much more probable its edges are on a pipe there than on texture.
         samples: the N contour samples.
         edges: their limb edges.
     """
@@ -55,6 +56,7 @@ class AdjustedCylinder:
     covariance: FloatArray
     used: NDArray[np.bool_]
     share: float
+    log_odds: float
     samples: ContourSamples
     edges: LimbEdges
 
@@ -85,20 +87,35 @@ def adjusted(scene: Scene, prior: FloatArray, so_far: FloatArray) -> AdjustedCyl
     if scene.cylinder.radius <= 0:
         return None
     share = support_profile(samples, hits(edges, solution.displacement)).share
-    return AdjustedCylinder(scene, step, solution.covariance, solution.used, share, samples, edges)
+    odds = _log_odds(samples, edges, solution)
+    return AdjustedCylinder(scene, step, solution.covariance, solution.used, share, odds, samples, edges)
 
 
 def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
-    """Of candidate steps (K, 5) the one that, after a pass on sub-pixel edges, explains most samples; so improved."""
+    """Of candidate steps (K, 5) the most probable one after a pass on sub-pixel edges; so improved."""
     trials = []
     for step in steps:
         found = _pass(scene, step, prior, step, COARSE_REACH, COARSE_SAMPLES)
         if found is None:
-            trials.append((step, 0.0))
+            trials.append((step, -np.inf))
         else:
-            _, edges, solution = found
-            trials.append((step + solution.step, float(hits(edges, solution.displacement).mean())))
+            samples, edges, solution = found
+            trials.append((step + solution.step, _log_odds(samples, edges, solution)))
     return max(trials, key=lambda trial: trial[1])[0]
+
+
+def _log_odds(samples: ContourSamples, edges: LimbEdges, solution: _Solution) -> float:
+    """Logarithm of how much more probable the edges are on a pipe in these places than on texture.
+
+    Edges alone do not tell: one side of a pipe with the edge of its shadow is seen as often as the pipe, but at another
+    depth, where the offsets of the views must make up for the parallax of cameras that are not in one line.
+    """
+    hit = hits(edges, solution.displacement)
+    views = len(np.unique(samples.view))
+    each = np.where(hit, np.log(HIT_RATE / TEXTURE), np.log((1.0 - HIT_RATE) / (1.0 - TEXTURE)))
+    offset = solution.view_offset[np.unique(samples.view)]
+    scatter = max(float(np.sqrt(np.mean(offset**2))), LEAST_OFFSET)
+    return float(each.sum() / (1.0 + COMMON * (views - 1))) - views * float(np.log(scatter / FIRST_OFFSET))
 
 
 def _pass(

@@ -26,6 +26,7 @@ class ContourFit:
             directions are across the axis, sideways as the views see it and away from them.
         radius_sigma: standard deviation of the radius [m].
         support: share (0 to 1) of the visible contour with an edge in three views or more.
+        log_odds: logarithm of how much more probable its edges are on a pipe there than on texture.
         views: number of views used.
         rims: evidence for an end rim at the start and at the end (`pipe_ends.End.odds`).
         flatness: 0 for a cylinder, whose contour keeps its distance from the axis from all sides; 1 for a painted strip
@@ -37,6 +38,7 @@ class ContourFit:
     covariance: FloatArray
     radius_sigma: float
     support: float
+    log_odds: float
     views: int
     rims: tuple[float, float]
     flatness: float
@@ -65,6 +67,7 @@ def contour_fit(found: AdjustedCylinder, ends: tuple[End | None, End | None]) ->
         covariance,
         float(np.sqrt(covariance[4, 4])),
         found.share,
+        found.log_odds,
         len(np.unique(found.samples.view[found.used])),
         (start.odds if start else 0.0, end.odds if end else 0.0),
         *flatness(found),

@@ -106,7 +106,7 @@ def refine(
             return None
         step = step + found.step
     if found is not None and follow:
-        found = followed(found, priors[-1], held)
+        found = followed(found, start.cylinder, priors[-1], held)
     if found is None or found.share < MIN_SUPPORT:
         return None
     surface = start.cylinder if start.ends_known else None

@@ -25,6 +25,9 @@ MIN_VIEWS, MIN_SHARE = 3, 0.5
 # real contour a number of views supports (0.34 of it by three views, 0.94 by eight); with 0.6 or 0.8 instead the
 # support changes by up to 60 % for three views and by up to 25 % for seven or more.
 HIT_RATE = 0.7
+# Rate of edges of texture, and the correlation between views of the evidence at one position: specks of texture and
+# dark areas are common to them.
+TEXTURE, COMMON = 0.2, 0.3
 # Support of what is taken for seen: one side along half of its length, or both along a quarter. Texture with an edge in
 # one of five views has at most 0.11 (by the binomial distribution, for any number of views).
 MIN_SUPPORT = 0.25

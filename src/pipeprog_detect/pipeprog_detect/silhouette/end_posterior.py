@@ -18,6 +18,7 @@ from pipeprog_detect.silhouette.pipe_ends import (
     RIM_WORTH,
     SAMPLES_PER_PIXEL,
     all_around,
+    before_bend,
     pixel_at,
     rim_strength,
 )
@@ -84,7 +85,7 @@ def end_posterior(cylinder: Cylinder, at_end: bool, views: Sequence[View], other
     odds = -np.maximum(position, 0.0) / cylinder.length
     evidence = axial_evidence(Scene.of(cylinder, looking, others), at_end, ahead)
     if evidence is not None:
-        odds += contour_odds(evidence, position)
+        odds += before_bend(contour_odds(evidence, position), position, evidence, cylinder.radius, pixel)
     showing = views_showing(barrel.end[None], views, ENOUGH_VIEWS)
     if showing:
         around = position < near

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
-from pipeprog_detect.silhouette.edge_support import SupportProfile, hits, support_profile
+from pipeprog_detect.silhouette.edge_support import COMMON, TEXTURE, SupportProfile, hits, support_profile
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene
@@ -24,10 +24,8 @@ SPACING, SAMPLES, SAMPLES_BESIDE = 6, 2400, 600
 # Distance beside the pipe at which texture alone is seen [px], and by how much the pipe's rate of edges must exceed
 # that of texture.
 BESIDE, LEAST_CONTRAST = 4.0, 0.15
-# Rate of edges of texture, and the number of samples that this prior weighs: it counts where little is seen beside.
-TEXTURE, TEXTURE_SEEN = 0.2, 20.0
-# Correlation between views of the evidence at one position: specks of texture and dark areas are common to them.
-COMMON = 0.3
+# Number of samples that the prior rate of texture's edges weighs: it counts where little is seen beside.
+TEXTURE_SEEN = 20.0
 # What a sample shows: no edge, or one that is brighter or darker within the contour than this far beside it [px].
 NO_EDGE, BRIGHTER, DARKER = 0, 1, 2
 STEP_AT = np.array([-1.5, 1.5])
@@ -79,10 +77,10 @@ class AxialEvidence:
     seen: FloatArray
 
 
-def followed(known: AdjustedCylinder, prior: FloatArray, held: FloatArray) -> AdjustedCylinder:
+def followed(known: AdjustedCylinder, start: Cylinder, prior: FloatArray, held: FloatArray) -> AdjustedCylinder:
     """A pipe of which a piece is known, as long as its contour is seen.
 
-    `prior` (5, 5): precision [1/m^2] of the piece's start; `held`: the same with the radius held.
+    `prior` (5, 5): precision [1/m^2] of the piece's `start`; `held`: the same with the radius held.
     """
     for _ in range(MAX_EXTENSIONS):
         length = known.cylinder.length
@@ -94,7 +92,8 @@ def followed(known: AdjustedCylinder, prior: FloatArray, held: FloatArray) -> Ad
             break
         # The prior's direction came from the shorter piece: the longer one's ends are more uncertain by their ratio.
         weaker = prior * (length / longer.length) ** 2
-        again = adjusted(known.scene.turned_to(longer), weaker, np.zeros(5))
+        scene = known.scene.turned_to(longer)
+        again = adjusted(scene, weaker, _step_from(start, scene))
         if again is None or again.share < LOST * known.share:
             break
         if again.share < WORSE * known.share or _widens(again, known) or _strays(again.cylinder, known):
@@ -103,6 +102,15 @@ def followed(known: AdjustedCylinder, prior: FloatArray, held: FloatArray) -> Ad
         else:
             known = again
     return known
+
+
+def _step_from(start: Cylinder, scene: Scene) -> FloatArray:
+    """Step (5,) of `Scene.moved` that leads from the start's axis, prolonged, to the scene's cylinder."""
+    cylinder = scene.cylinder
+    ends = np.stack([cylinder.start, cylinder.end])
+    offset = ends - start.start
+    aside = (offset - np.outer(offset @ start.axis, start.axis)) @ scene.basis.T
+    return np.append(aside.ravel(), cylinder.radius - start.radius)
 
 
 def _widens(longer: AdjustedCylinder, known: AdjustedCylinder) -> bool:

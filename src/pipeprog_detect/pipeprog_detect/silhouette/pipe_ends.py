@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ViewArrays, project
+from pipeprog_detect.silhouette.edge_support import NEAR
 from pipeprog_detect.silhouette.extension import AxialEvidence, axial_evidence
 from pipeprog_detect.silhouette.light_sampling import light_at
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, hidden_by_cloud, hidden_by_cylinders
@@ -42,8 +43,11 @@ OUTER_PENALTY = 0.3
 LEAST_OUTSIDE = 3
 # Scale [m] of the Cauchy distribution of the barrel's end about that of the cloud's surface, which may be torn.
 SURFACE_SIGMA = 0.01
-# The cloud's surface goes on over the end by half a stereo window [m], and into a bend of three radii as far as that
-# stays within the surface's thickness [m].
+# Radius of the bend of an elbow, in radii of the pipe (a long one, EN 10253: 1.5 diameters), and the share of ends at
+# an elbow: as many as not.
+BEND, AT_ELBOW = 3.0, 0.5
+# The cloud's surface goes on over the end by half a stereo window [m], and into a bend as far as that stays within the
+# surface's thickness [m].
 FATTENED, THICKNESS = 0.02, 0.006
 
 
@@ -83,7 +87,7 @@ def find_end(scene: Scene, at_end: bool, surface_end: float | None) -> End | Non
     outside = max(OUTSIDE, OUTSIDE_RADII * cylinder.radius)
     inside = min(outside, MOST_INSIDE * cylinder.length)
     if surface_end is not None:
-        inside = min(inside, FATTENED + float(np.sqrt(6.0 * cylinder.radius * THICKNESS)) - surface_end)
+        inside = min(inside, FATTENED + into_bend(cylinder.radius, THICKNESS) - surface_end)
     evidence = axial_evidence(scene, at_end, outside)
     if evidence is None:
         return None
@@ -103,9 +107,36 @@ def find_end(scene: Scene, at_end: bool, surface_end: float | None) -> End | Non
     rim = all_around(strength, seen) - OUTER_PENALTY * np.maximum(along, 0.0) / outside
     if surface_end is not None:
         odds = odds - np.log1p(((position - surface_end) / SURFACE_SIGMA) ** 2)
-    likely = np.interp(along, position, odds) - float(odds.max())
+    likely = before_bend(np.interp(along, position, odds) - float(odds.max()), along, evidence, cylinder.radius, pixel)
     best = int(np.argmax(np.where(likely > -PLAUSIBLE, likely + RIM_WORTH * rim, -np.inf)))
     return End(*_refined(strength, seen, along, best, pixel), RIM_WORTH * _contrast(rim, best))
+
+
+def into_bend(radius: float, aside: float) -> float:
+    """How far [m] an elbow on a pipe of `radius` [m] goes on along its axis before it is `aside` [m] of it."""
+    return float(np.sqrt(2.0 * BEND * radius * aside))
+
+
+def before_bend(
+    odds: FloatArray, position: FloatArray, evidence: AxialEvidence, radius: float, pixel: float
+) -> FloatArray:
+    """Log odds (T,) that the barrel ends at even positions (T,) [m], whether an elbow follows or not.
+
+    An elbow's contour leaves the barrel's by less than edges are told apart for some way: what is seen to end there may
+    be the elbow's. Where something hides the end nothing is seen to end.
+
+    Args:
+        odds: (T,) that the contour ends there.
+        position: (T,) outwards [m].
+        evidence: of the contour.
+        radius: of the pipe [m].
+        pixel: one at the end [m].
+    """
+    next_sample = np.minimum(np.searchsorted(evidence.along, position), len(evidence.along) - 1)
+    in_sight = np.where(evidence.seen[next_sample] > 0, odds, -np.inf)
+    ahead = int(into_bend(radius, NEAR * pixel) / float(position[1] - position[0]))
+    later = maximum_filter1d(in_sight, ahead + 1, mode="nearest", origin=-((ahead + 1) // 2))
+    return np.asarray(np.maximum(odds, later + np.log(AT_ELBOW)), np.float64)
 
 
 def pixel_at(point: FloatArray, views: Sequence[View]) -> float:
@@ -148,13 +179,19 @@ def _contrast(rim: FloatArray, best: int) -> float:
 def all_around(strength: FloatArray, seen: NDArray[np.bool_]) -> FloatArray:
     """By how much the edges (V * SECTORS, T) of all sectors exceed the median position's, at each position (T,).
 
-    Texture has edges in some sectors: the weaker half of them counts. Where nothing is seen it is 0.
+    Texture has edges in some sectors: the weaker half counts of those that are seen. Where no more than half of all are
+    seen it is 0.
     """
     count = seen.reshape(-1, SECTORS, seen.shape[1]).sum(axis=0)
-    mean = strength.reshape(-1, SECTORS, seen.shape[1]).sum(axis=0) / (count + 1.0)
-    weaker = np.sort(mean, axis=0)[: SECTORS // 2].mean(axis=0)
-    shown = count.min(axis=0) > 0
-    return np.where(shown, weaker - np.median(weaker[shown]), 0.0) if shown.any() else np.zeros(len(weaker))
+    mean = np.where(count > 0, strength.reshape(-1, SECTORS, seen.shape[1]).sum(axis=0) / (count + 1.0), np.inf)
+    sectors = (count > 0).sum(axis=0)
+    shown = sectors > SECTORS // 2
+    if not shown.any():
+        return np.zeros(len(shown))
+    half = np.maximum(sectors // 2, 1)
+    total = np.cumsum(np.sort(mean, axis=0), axis=0)
+    weaker = total[half - 1, np.arange(len(half))] / half
+    return np.where(shown, weaker - np.median(weaker[shown]), 0.0)
 
 
 def _odds(evidence: AxialEvidence, inside: float) -> tuple[FloatArray, FloatArray]:

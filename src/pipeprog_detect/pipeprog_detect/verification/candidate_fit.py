@@ -48,7 +48,7 @@ class CandidateFitter:
         follow: bool = True,
         trusted: bool = False,
     ) -> ContourFit | None:
-        """The best supported fit from where the cloud has the candidate; None where the views show too little.
+        """The most probable fit from where the cloud has the candidate; None where the views show too little.
 
         Args:
             candidate: of the cloud.
@@ -64,7 +64,7 @@ class CandidateFitter:
         if known:
             return best
         fits = [_settled(start, views, others, self._radii(), follow) for start in self._starts(candidate, trusted)]
-        best = max((fit for fit in fits if fit is not None), key=lambda fit: fit.support, default=None)
+        best = max((fit for fit in fits if fit is not None), key=lambda fit: fit.log_odds, default=None)
         self.cache.keep(question, best)
         return best
 
@@ -89,7 +89,7 @@ class CandidateFitter:
     def of_planned_radius(
         self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]
     ) -> ContourFit | None:
-        """The best supported fit of a planned radius that the cloud of a candidate allows; None without one.
+        """The most probable fit of a planned radius that the cloud of a candidate allows; None without one.
 
         Lines beside a thin pipe, such as its shadow's, are taken for its contour where its radius is left open. A fit
         that they have led three standard deviations away from the planned radius is one of theirs.
@@ -105,7 +105,7 @@ class CandidateFitter:
             and self.is_planned(fit)
             and abs(fit.cylinder.radius - planned) < REACH * fit.radius_sigma + MANUFACTURE * planned
         ]
-        return max(good, key=lambda fit: fit.support, default=None)
+        return max(good, key=lambda fit: fit.log_odds, default=None)
 
     def of_visible_side(
         self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]

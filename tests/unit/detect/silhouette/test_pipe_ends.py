@@ -6,7 +6,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.pipe_ends import FATTENED, THICKNESS, find_end
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.silhouette.extension import AxialEvidence
+from pipeprog_detect.silhouette.pipe_ends import (
+    AT_ELBOW,
+    FATTENED,
+    THICKNESS,
+    all_around,
+    before_bend,
+    find_end,
+    into_bend,
+)
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -59,3 +69,31 @@ def test_an_end_rim_raises_the_odds_of_an_end(pipe_views: list[View]) -> None:
     found = find_end(Scene.of(PIPE, pipe_views, []), True, None)
     assert found is not None
     assert found.odds > 1.0
+
+
+def test_what_ends_may_be_an_elbow_unless_it_is_hidden() -> None:
+    """As far back as the contour of an elbow stays within the reach of edges, and not from what hides the end."""
+    position: FloatArray = np.linspace(-0.1, 0.1, 201, dtype=np.float64)
+    odds = -1e3 * np.abs(position)
+    radius, pixel = 0.05, 2e-3
+    bend = into_bend(radius, 0.6 * pixel)
+    assert bend**2 / (2.0 * 3.0 * radius) == pytest.approx(0.6 * pixel)
+    steps: FloatArray = np.linspace(-0.1, 0.1, 21, dtype=np.float64)
+    shown = AxialEvidence(steps, np.zeros(len(steps)), np.full(len(steps), 9))
+    hidden = AxialEvidence(steps, np.zeros(len(steps)), np.where(steps > -0.015, 0, 9))
+    back = before_bend(odds, position, shown, radius, pixel)
+    at = np.searchsorted(position, [-0.9 * bend, -1.5 * bend, 0.05])
+    assert back[at[0]] == pytest.approx(np.log(AT_ELBOW), abs=1e-6)
+    assert back[at[1]] < -0.4e3 * bend
+    assert back[at[2]] == odds[at[2]]
+    assert before_bend(odds, position, hidden, radius, pixel)[at[0]] < -5.0
+
+
+@pytest.mark.parametrize(("sectors", "told"), [(6, True), (4, True), (3, False)])
+def test_a_rim_is_told_where_more_than_half_of_the_barrel_is_seen(sectors: int, told: bool) -> None:
+    strength = np.full((6, 50), 0.1)
+    strength[:, 20] = 0.8
+    seen = np.zeros((6, 50), bool)
+    seen[:sectors] = True
+    found = all_around(np.where(seen, strength, 0.0), seen)
+    assert (int(np.argmax(found)) == 20 and found[20] > 0.3) == told

@@ -29,7 +29,7 @@ def test_a_fit_keeps_to_the_planned_radius_that_it_was_sought_with(
     monkeypatch: pytest.MonkeyPatch, sigmas: float, stands: bool
 ) -> None:
     found = replace(PIPE, radius=PLANNED + sigmas * SIGMA)
-    fit = ContourFit(found, np.eye(5), SIGMA, 0.7, 20, (0.0, 0.0), 0.0, 0.5)
+    fit = ContourFit(found, np.eye(5), SIGMA, 0.7, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
     monkeypatch.setattr(candidate_fit, "_at_radius", lambda *_: fit)
     boq = BillOfQuantities((PipeClass("copper 17", PLANNED, 10.0, (1.0, 0.0, 1.0), 1e-4),))
     assert BLURRED.blurred
@@ -61,7 +61,7 @@ def test_a_fit_out_of_the_candidates_reach_gives_way_to_a_planned_one(monkeypatc
     """Two pipes of a rack 8 cm apart: the outer edge of one and that of the other make a thick pipe."""
     rough = Candidate(replace(PIPE, radius=0.0436), 0.0023, 15000, CloudEvidence(2.6, 0.9, 0.0, 0.0032, 0.0, 3.0))
     both, own = (
-        ContourFit(replace(PIPE, radius=radius), np.eye(5), 2e-4, support, 20, (0.0, 0.0), 0.0, 0.5)
+        ContourFit(replace(PIPE, radius=radius), np.eye(5), 2e-4, support, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
         for radius, support in ((0.0559, 0.85), (0.0367, 1.0))
     )
     boq = _boq(0.0365, 0.0559)

@@ -38,7 +38,7 @@ def test_an_end_on_the_floor_is_at_a_wall_whichever_side_rounding_puts_it(pipe_v
 
 
 def test_an_end_behind_a_thick_pipe_is_hidden(pipe_views: list[View]) -> None:
-    start, end = ends_in_views(PIPE, NO_WALLS, pipe_views, [across(PIPE.end[2] + 0.03, 0.06)])
+    start, end = ends_in_views(PIPE, NO_WALLS, pipe_views, [across(PIPE.end[2] + 0.03, 0.08)])
     assert (start.state, end.state) == ("free", "hidden")
 
 
