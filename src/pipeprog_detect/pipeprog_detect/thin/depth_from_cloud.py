@@ -15,6 +15,9 @@ from pipeprog_detect.types import Cylinder, View
 
 # Width of the strip of cloud beside a thin pipe that it is compared with, in its own widths.
 BESIDE_REACH = 4.0
+# Strip of cloud beside a thin pipe in which a face that it is the edge of must go on: beyond what half a stereo window
+# spreads of the pipe itself, in radii.
+FACE = (4.0, 8.0)
 # Distance before and behind a proposed axis in which the cloud counts [m].
 DEPTH_REACH = 0.3
 # Along the lines of sight to a thin pipe the cloud shows more of the wall than of it: this percentile of the depths is
@@ -63,22 +66,14 @@ def at_cloud_depth(
     Where these lie no nearer than those beside it they are the wall's: the cloud does not show the pipe there. Unless
     it is `sloping` it keeps its direction.
     """
-    axis, towards, side = _sight(cylinder, centre)
+    towards = _sight(cylinder, centre)[1]
     depth = float((cylinder.start - centre) @ towards)
-    offset = points - centre.astype(np.float32)
-    far = offset @ towards.astype(np.float32)
-    near = np.abs(far - depth) < DEPTH_REACH
-    offset, far = offset[near], far[near]
-    place = (offset @ axis.astype(np.float32)) * depth / far - float((cylinder.start - centre) @ axis)
-    aside = (offset @ side.astype(np.float32)) * depth / far
-    along = (place > 0) & (place < cylinder.length)
-    bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
-    cell = np.clip((place / cylinder.length * bins).astype(int), 0, bins - 1)
-    inner = along & (np.abs(aside) < 0.6 * cylinder.radius)
+    bins, cell, aside, far = _beside(cylinder, points, centre)
+    inner = np.abs(aside) < 0.6 * cylinder.radius
     front = by_bin(cell[inner], far[inner], bins, FRONT)
     flanks = []
     for sign in (-1.0, 1.0):
-        beside = along & (sign * aside > 2.4 * cylinder.radius) & (sign * aside < 2.0 * BESIDE_REACH * cylinder.radius)
+        beside = (sign * aside > 2.4 * cylinder.radius) & (sign * aside < 2.0 * BESIDE_REACH * cylinder.radius)
         flanks.append(by_bin(cell[beside], far[beside], bins, FRONT))
     known = np.isfinite(front) & ~(np.fmax(*flanks) - front < cylinder.radius)
     if known.sum() < 0.3 * bins:
@@ -97,6 +92,50 @@ def at_cloud_depth(
         ray = end - centre
         ends.append(centre + ray * (1.0 / (level + share * slope) + 0.5 * cylinder.radius) / float(ray @ towards))
     return Cylinder(ends[0], ends[1], cylinder.radius)
+
+
+def is_edge_of_face(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) -> bool:
+    """Whether a face whose edge it is goes on beside it: a tray's, a duct's or a board's.
+
+    Seen from `centre`, the cloud's points (N, 3) then lie as far away beside it, on one side, as on it, and on the
+    other side farther away by its diameter at least.
+    """
+    depth, radius = float((cylinder.start - centre) @ _sight(cylinder, centre)[1]), cylinder.radius
+    bins, cell, aside, far = _beside(cylinder, points, centre)
+
+    def level(least: float, most: float) -> FloatArray:
+        there = (aside > least * radius) & (aside < most * radius)
+        return by_bin(cell[there], far[there], bins, 50.0)
+
+    on, beside = level(-0.6, 0.6), (level(-FACE[1], -FACE[0]), level(*FACE))
+    shown = np.abs(on - depth) < 2.0 * radius
+    flush, open_beside = (
+        [np.abs(each - on) < radius for each in beside],
+        [~(each - on < 2.0 * radius) for each in beside],
+    )
+    edge = [shown & one & other for one, other in zip(flush, reversed(open_beside), strict=True)]
+    return bool(max(each.sum() for each in edge) > 0.5 * bins)
+
+
+def _beside(
+    cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray
+) -> tuple[int, NDArray[np.int64], NDArray[np.floating], NDArray[np.floating]]:
+    """The cloud's points (N, 3) that `centre` sees along a cylinder, no farther from its depth than `DEPTH_REACH`.
+
+    Number of bins along it; bin (M,), distance from the axis in the image, at its depth (M,) [m], and depth (M,) [m].
+    """
+    axis, towards, side = _sight(cylinder, centre)
+    depth = float((cylinder.start - centre) @ towards)
+    offset = points - centre.astype(np.float32)
+    far = offset @ towards.astype(np.float32)
+    near = np.abs(far - depth) < DEPTH_REACH
+    offset, far = offset[near], far[near]
+    place = (offset @ axis.astype(np.float32)) * depth / far - float((cylinder.start - centre) @ axis)
+    aside = (offset @ side.astype(np.float32)) * depth / far
+    along = (place > 0) & (place < cylinder.length)
+    bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
+    cell = np.clip((place[along] / cylinder.length * bins).astype(np.int64), 0, bins - 1)
+    return bins, cell, aside[along], far[along]
 
 
 @njit(cache=True, nogil=True)

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, project
+from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, contour_samples, project
 from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line
 from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
@@ -25,6 +25,9 @@ STEP, MOST_VIEWS = 0.12, 120
 ENOUGH = 4.5
 # Standard deviations of a segment pair's centre line and width [px], shading and shadows beside the pipe included.
 CENTRE_SIGMA, WIDTH_SIGMA = 1.0, 1.2
+# A segment lies on an outline within two standard deviations of its place [px]. Spacing [px] of the outline's samples:
+# it is straight.
+ON_OUTLINE, OUTLINE_SPACING = 2.0, 40.0
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ def _pair_view(
     for cylinder in known:
         within |= _within_silhouette(found, cylinder, view)
     found = found.select(~within)
+    found = found.select(~between_outlines(found, known, view))
     before, flat = _cloud_depths(found, pixel, depth, min(radii))
     return PairView(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
 
@@ -223,6 +227,32 @@ def _within_silhouette(found: SegmentPairs, cylinder: Cylinder, view: View) -> N
     aside = np.abs(offset @ np.array([-along[1], along[0]]))
     reach = view.camera.fx * cylinder.radius / depth.min()
     return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
+
+
+def between_outlines(found: SegmentPairs, known: Sequence[Cylinder], view: View) -> NDArray[np.bool_]:
+    """Segment pairs (N,) whose sides are both outlines of known cylinders: what is seen between these is no pipe."""
+    taken = np.zeros((len(found), 2), bool)
+    if not len(found):
+        return taken[:, 0]
+    along = found.ends[:, 1] - found.ends[:, 0]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
+    half = 0.5 * found.width[..., None] * across[:, None]
+    sides = np.stack([found.ends - half, found.ends + half], axis=1)  # (N, side, end, 2)
+    for cylinder in known:
+        outline = contour_samples(cylinder, [view], np.eye(3)[:2], spacing=OUTLINE_SPACING, margin=0.0)
+        for side in (0, 1):
+            line = outline.pixel[outline.side == side]
+            if len(line) < 2:
+                continue
+            run = line[-1] - line[0]
+            length = float(np.linalg.norm(run))
+            offset = (sides - line[0]) / length
+            place = offset @ run / length
+            aside = np.abs(offset @ np.array([-run[1], run[0]]))
+            common = np.minimum(place.max(axis=2), 1.0) - np.maximum(place.min(axis=2), 0.0)
+            along_it = common > 0.5 * (place.max(axis=2) - place.min(axis=2))
+            taken |= along_it & (aside < ON_OUTLINE).all(axis=2)
+    return taken[:, 0] & taken[:, 1]
 
 
 def rays(pair_view: PairView) -> FloatArray:

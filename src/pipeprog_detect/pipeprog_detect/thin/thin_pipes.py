@@ -16,7 +16,7 @@ from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
-from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
+from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, is_edge_of_face, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.thin.pair_views import pair_views
 from pipeprog_detect.thin.parallel_axes import (
@@ -83,6 +83,9 @@ def find_thin_pipes(
     def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
             return
+        centre = mean_centre(fit.cylinder, views)
+        if centre is not None and is_edge_of_face(fit.cylinder, some, centre):
+            return
         thin.append(MeasuredPipe(_as_candidate(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
         known.append(fit.cylinder)
 
@@ -127,7 +130,7 @@ class _LineFitter:
         """The whole of a pipe of which the direction is known; None where its contour is not seen.
 
         Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
-        away looks the same, from where the cloud has it, too, and the best supported fit counts.
+        away looks the same, from where the cloud has it, too, and the most probable fit counts.
         """
         start, depth_sigma = proposal.cylinder, proposal.depth_sigma
         if depth_sigma <= DEPTH_SIGMA * start.radius:
@@ -137,9 +140,14 @@ class _LineFitter:
         rough = [(start, min(depth_sigma, DEPTH_REACH))] + ([] if at_depth is None else [(at_depth, LINE_DEPTH_SIGMA)])
         starts = [Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True) for each, sigma in rough]
         located = [refine(each, self.views, known, self.radii) for each in starts]
-        again = [replace(fit.cylinder, radius=start.radius) for fit in located if fit is not None]
+        # The known direction is evidence once: the fit has drawn the axis from it as far as the views did.
+        again = [
+            turned(replace(fit.cylinder, radius=start.radius), start.axis, self.views)
+            for fit in located
+            if fit is not None
+        ]
         fits = [self._parallel(each, LINE_DEPTH_SIGMA, known) for each in again]
-        return max((fit for fit in fits if fit is not None), key=lambda fit: fit.support, default=None)
+        return max((fit for fit in fits if fit is not None), key=lambda fit: fit.log_odds, default=None)
 
     def _parallel(self, start: Cylinder, depth_sigma: float, known: Sequence[Cylinder]) -> ContourFit | None:
         """The accepted fit of a pipe that is parallel to known ones.
@@ -207,9 +215,7 @@ def aligned(
     the slope, if they differ from it by less than three of its standard deviations, `slope_known_to` [rad]. With fewer
     than `LEAST_PARALLEL` of them the cylinder is returned as it is, with infinity.
     """
-    middle = proposed.middle
-    across = np.cross(proposed.axis, viewing_direction(proposed, views))
-    across = across / np.linalg.norm(across)
+    across = _sideways(proposed, views)
     towards = np.cross(across, proposed.axis)
     axes = np.array([other.axis * np.sign(other.axis @ proposed.axis) for other in known]).reshape(-1, 3)
     steepest = max(np.tan(NEARLY_PARALLEL), 3.0 * slope_known_to)
@@ -219,9 +225,24 @@ def aligned(
         return proposed, np.inf
     direction = np.median(axes, axis=0)
     spread = float(np.median(np.linalg.norm(axes - direction, axis=1)))
-    direction = direction - (direction @ across) * across
-    half = 0.5 * proposed.length * direction / np.linalg.norm(direction)
-    return Cylinder(middle - half, middle + half, proposed.radius), max(spread, PARALLEL_SIGMA)
+    return turned(proposed, direction, views), max(spread, PARALLEL_SIGMA)
+
+
+def turned(cylinder: Cylinder, direction: FloatArray, views: Sequence[View]) -> Cylinder:
+    """The cylinder turned towards the cameras or away from them until it runs along `direction` (3,); its image stays.
+
+    Its middle and its length stay as well.
+    """
+    across = _sideways(cylinder, views)
+    along = direction - (direction @ across) * across
+    half = 0.5 * cylinder.length * along / np.linalg.norm(along)
+    return Cylinder(cylinder.middle - half, cylinder.middle + half, cylinder.radius)
+
+
+def _sideways(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
+    """Unit vector (3,) across the axis and across the lines of sight to it."""
+    across = np.cross(cylinder.axis, viewing_direction(cylinder, views))
+    return np.asarray(across / np.linalg.norm(across), np.float64)
 
 
 def _as_candidate(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.thin.thin_pipes import NEARLY_PARALLEL, _LineFitter, aligned, is_shadow
+from pipeprog_detect.thin.thin_pipes import NEARLY_PARALLEL, _LineFitter, aligned, is_shadow, turned
 from pipeprog_detect.types import Cylinder
 from tests.unit.detect.straight_ahead import looking_along_y
 
@@ -41,6 +41,21 @@ def test_a_slope_that_may_be_wrong_is_that_of_the_pipes_beside(slope: float, kno
         assert found == proposed
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+def test_a_turned_pipe_keeps_its_image(slope: float, turn: float, to: float) -> None:
+    """It is turned in the plane of the lines of sight; what the direction has beside that plane is left out."""
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    before = level(0.7, slope, turn)
+    after = turned(before, level(1.0, to, 0.1).axis, views)
+    across = np.cross(before.axis, [0.0, 1.0, 0.0])
+    assert abs(after.axis @ across) < 1e-9
+    assert np.allclose(after.middle, before.middle)
+    assert after.length == pytest.approx(before.length)
+    same = turned(before, before.axis, views)
+    assert np.allclose(same.axis, before.axis)
+
+
 def test_what_runs_in_another_direction_in_the_image_is_not_parallel() -> None:
     views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     beside = [level(length, turn=np.radians(8.0)) for length in (1.0, 2.0, 3.0)]
@@ -63,6 +78,6 @@ def test_a_rod_of_another_size_is_no_thin_pipe(sigmas: float, stands: bool) -> N
     boq = BillOfQuantities((PipeClass("copper 17", planned, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     rod = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned + sigmas * sigma)
-    fit = ContourFit(rod, np.eye(5), sigma, 0.9, 20, (0.0, 0.0), 0.0, 0.1)
+    fit = ContourFit(rod, np.eye(5), sigma, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
     lines = _LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
     assert lines._accepts(fit, [], (0.6, 0.0)) is stands
