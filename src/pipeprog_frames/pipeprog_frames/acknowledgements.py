@@ -22,12 +22,14 @@ class Answer:
         keyframes: number of keyframes that it has considered.
         retirements: number of retirements that it has considered.
         reports: overlaps that changed.
+        readout: of the rolling shutter in use, s; 0: none, or none known yet.
     """
 
     stamp: int
     keyframes: int
     retirements: int
     reports: tuple[OverlapReport, ...]
+    readout: float = 0.0
 
 
 class Ledger:
@@ -50,7 +52,7 @@ class Ledger:
         self._retirements += 1
 
     def receive(self, answer: Answer) -> None:
-        """Notes an answer; its reports wait until they are asked for.
+        """Notes an answer, which waits until it is asked for.
 
         Raises InputError for an answer that cannot be the SfM's: to more than was published, or a second time.
         """
@@ -76,10 +78,10 @@ class Ledger:
                 "ROS domain?"
             )
 
-    def reports(self, keyframes: int) -> Iterator[tuple[OverlapReport, ...]]:
-        """Takes out the reports of answers to no more than the first `keyframes` keyframes."""
+    def answers(self, keyframes: int) -> Iterator[Answer]:
+        """Takes out the answers to no more than the first `keyframes` keyframes."""
         while self._answers and self._answers[0].keyframes <= keyframes:
-            yield self._answers.popleft().reports
+            yield self._answers.popleft()
 
     @property
     def is_answered(self) -> bool:

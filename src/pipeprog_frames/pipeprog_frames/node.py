@@ -349,8 +349,8 @@ class FramesNode(Node):
 
     def _apply_reports(self, keyframes: int) -> None:
         """Uses the answers to the first `keyframes` keyframes; later ones wait, so that a replay repeats itself."""
-        for reports in self._ledger.reports(keyframes):
-            self._revise(self._selection.answer(reports))
+        for answer in self._ledger.answers(keyframes):
+            self._revise(self._selection.answer(answer.reports, answer.readout))
 
     def _health(self) -> tuple[bytes, str, dict[str, Any]]:
         values = {
@@ -394,7 +394,7 @@ def _raw(message: Image) -> Arrival:
 def _answer(message: ImageOverlapArray) -> Answer:
     answer = received_keyframes.image_overlaps(message)
     reports = tuple(OverlapReport(**vars(image)) for image in answer.images)
-    return Answer(answer.stamp, answer.keyframes, answer.retirements, reports)
+    return Answer(answer.stamp, answer.keyframes, answer.retirements, reports, answer.readout)
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 from pipeprog_frames.frame_decision import Decision
 
@@ -60,6 +61,10 @@ class StreamFeedback:
     decisions that are noted).
 
     This terminates: a frame that was added is never retired, and a retired one is never added again.
+
+    Attributes:
+        max_gap: ns. Two keyframes that are farther apart in time get a frame between them, and none is retired whose
+            neighbours are; None: no matter how far.
     """
 
     def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, best_between: BestBetween) -> None:
@@ -68,6 +73,7 @@ class StreamFeedback:
         self._stamps: list[int] = []
         self._keyframes: dict[int, _Keyframe] = {}
         self._retired: set[int] = set()
+        self.max_gap: int | None = None
 
     def chosen(self, decision: Decision) -> None:
         """Notes a keyframe that the selector has chosen."""
@@ -89,7 +95,7 @@ class StreamFeedback:
         for stamp in list(self._stamps):
             if self._is_judged(stamp, complete):
                 decisions += self._add_beside(stamp)
-        return decisions + self._thin(complete)
+        return decisions + self._close_gaps() + self._thin(complete)
 
     def _insert(self, keyframe: _Keyframe) -> None:
         if keyframe.stamp not in self._keyframes:
@@ -144,6 +150,18 @@ class StreamFeedback:
         self._insert(_Keyframe(stamp, float("nan"), float("nan"), fixed=True))
         return [Decision(stamp, True, reason)]
 
+    def _close_gaps(self) -> list[Decision]:
+        """Adds a frame between registered keyframes that are too far apart in time."""
+        decisions: list[Decision] = []
+        for first, second in pairwise(list(self._stamps)):
+            reports = self._keyframes[first].report, self._keyframes[second].report
+            if self._is_gap(first, second) and all(report is not None and report.registered for report in reports):
+                decisions += self._fill(first, second, "for the motion between images of a rolling shutter")
+        return decisions
+
+    def _is_gap(self, first: int, second: int) -> bool:
+        return self.max_gap is not None and second - first > self.max_gap
+
     def _thin(self, complete: bool) -> list[Decision]:
         decisions = []
         run: list[int] = []
@@ -164,8 +182,8 @@ class StreamFeedback:
     def _retire(self, stamp: int) -> list[Decision]:
         """Retires a keyframe unless the selector would fill the gap again."""
         keyframe = self._keyframes[stamp]
-        _, after = self._neighbours(stamp)
-        if keyframe.fixed or after is None:
+        before, after = self._neighbours(stamp)
+        if keyframe.fixed or after is None or (before is not None and self._is_gap(before, after)):
             return []
         following = self._keyframes[after]
         overlap = keyframe.overlap + following.overlap - 1.0

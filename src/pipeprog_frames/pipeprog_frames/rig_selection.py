@@ -74,10 +74,14 @@ class RigSelection:
         for selection in self._of.values():
             selection.lag(keyframes)
 
-    def answer(self, reports: Iterable[OverlapReport]) -> Selected:
-        """Takes overlap reports of any camera; returns keyframes to add and to retire."""
+    def answer(self, reports: Iterable[OverlapReport], readout: float = 0.0) -> Selected:
+        """Takes overlap reports of any camera and the read-out in use, s; returns keyframes to add and to retire."""
         reports = tuple(reports)
-        return [each for name, selection in self._of.items() for each in self._named(name, selection.answer(reports))]
+        return [
+            each
+            for name, selection in self._of.items()
+            for each in self._named(name, selection.answer(reports, readout))
+        ]
 
     def finish_round(self) -> Selected:
         """What to add and retire once all images have come and the SfM has answered to all keyframes."""

@@ -60,9 +60,9 @@ class Selection:
         if isinstance(self._policy, KeyframeStream):
             self._policy.lag(keyframes)
 
-    def answer(self, reports: Iterable[OverlapReport]) -> Selected:
-        """Takes overlap reports; returns keyframes to add and to retire."""
-        return self._selected(self._policy.answer(reports) if self._policy else [])
+    def answer(self, reports: Iterable[OverlapReport], readout: float = 0.0) -> Selected:
+        """Takes overlap reports and the read-out in use, s; returns keyframes to add and to retire."""
+        return self._selected(self._policy.answer(reports, readout) if self._policy else [])
 
     def finish_round(self) -> Selected:
         """What to add and retire once all images have come and the SfM has answered to all keyframes."""

@@ -36,14 +36,14 @@ def test_nothing_is_published_while_a_retirement_is_unanswered() -> None:
     assert ledger.is_answered
 
 
-def test_reports_wait_until_they_are_asked_for() -> None:
+def test_answers_wait_until_they_are_asked_for() -> None:
     ledger = Ledger()
     for stamp in range(3):
         ledger.publish(stamp)
         ledger.receive(answer(stamp, stamp + 1))
-    assert [report.stamp for reports in ledger.reports(2) for report in reports] == [0, 1]
-    assert [report.stamp for reports in ledger.reports(2) for report in reports] == []
-    assert [report.stamp for reports in ledger.reports(3) for report in reports] == [2]
+    assert [report.stamp for each in ledger.answers(2) for report in each.reports] == [0, 1]
+    assert [report.stamp for each in ledger.answers(2) for report in each.reports] == []
+    assert [report.stamp for each in ledger.answers(3) for report in each.reports] == [2]
 
 
 def test_a_keyframe_that_was_lost_on_the_way_does_not_count_as_lag_for_ever() -> None:
@@ -66,11 +66,11 @@ def test_an_answer_that_the_sfm_of_a_replay_cannot_have_given_is_refused() -> No
     for _ in range(20_000):
         with pytest.raises(InputError, match="a second answer to 1 keyframes"):
             ledger.receive(answer(0, 1))
-    assert len(list(ledger.reports(2))) == 1
+    assert len(list(ledger.answers(2))) == 1
 
 
 def test_live_the_sfm_may_have_worked_for_others_before() -> None:
     ledger = Ledger()
     ledger.publish(0)
     ledger.receive(answer(7, 500))
-    assert len(list(ledger.reports(500))) == 1
+    assert len(list(ledger.answers(500))) == 1

@@ -285,6 +285,25 @@ def test_what_the_sfm_answers_adds_and_retires_keyframes(stage: Callable[..., St
     assert not scene.retired, "the selector has left none out that the overlap does not ask for"
 
 
+def test_a_rolling_shutter_gets_keyframes_that_are_dense_in_time(stage: Callable[..., Stage], wall: NDArray) -> None:
+    scene = stage()
+    for index in range(60):
+        stamp = START + index * 33_000_000
+        scene.show(stamp, compressed(stamp, view(wall, 4 * index)))
+    chosen = scene.chosen()
+    assert max(np.diff(chosen)) > 400_000_000
+    scene.publish_answer(
+        ImageOverlapArray(
+            header=messages.header(chosen[-1], "camera"),
+            keyframes_considered=len(chosen),
+            images=[report(stamp, 0.86, 500, 500) for stamp in chosen],
+            readout=0.015,
+        )
+    )
+    scene.spin_until(lambda: len(scene.keyframes) > len(chosen))
+    scene.spin_until(lambda: any("rolling shutter" in decision.reason for decision in scene.decisions))
+
+
 def test_a_recording_becomes_a_network(stage: Callable[..., Stage], wall: NDArray) -> None:
     """0.5 frames a second, of which the SfM's answers leave every second one, until no group is above the band."""
     scene = stage("-p", "policy:=network", "-p", "lockstep:=true")

@@ -69,8 +69,8 @@ class ImageNetwork:
         self._last_stamp, self._next_start = None, 0
         return []
 
-    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
-        """Takes overlap reports; nothing changes before the SfM has answered to all images."""
+    def answer(self, reports: Iterable[OverlapReport], readout: float = 0.0) -> list[Decision]:
+        """Takes overlap reports; nothing changes before the SfM has answered to all images, nor by the read-out."""
         self._reports.update((report.stamp, report) for report in reports)
         return []
 

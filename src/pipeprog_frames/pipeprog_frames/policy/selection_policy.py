@@ -29,8 +29,11 @@ class Policy(Protocol):
         Its camera may be another, and its stamp earlier.
         """
 
-    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
-        """Takes overlap reports of the SfM; returns keyframes to add (chosen) and to retire (not chosen)."""
+    def answer(self, reports: Iterable[OverlapReport], readout: float = 0.0) -> list[Decision]:
+        """Takes overlap reports of the SfM; returns keyframes to add (chosen) and to retire (not chosen).
+
+        readout: of the rolling shutter in use, s; 0: none, or none known yet.
+        """
 
     def finish_round(self) -> list[Decision]:
         """What to add and retire once all frames have come and the SfM has answered to all keyframes; empty: done."""

@@ -13,6 +13,9 @@ from pipeprog_frames.overlap_feedback import BestBetween, OverlapReport, StreamF
 from pipeprog_frames.policy.selector import FrameSelector
 
 UNLOADED_LAG = 5  # keyframes that the SfM may be behind without load: a bundle adjustment takes seconds at times
+# ns between two keyframes of a rolling shutter, whose velocities are those of a curve through their poses: a step sways
+# the camera at 1.7 Hz, which such a curve knows to a fifth at 0.2 s, and not at all at 0.3 s.
+MAX_GAP = 220_000_000
 FULL_LAG = 25  # keyframes behind at which the load counts as full: half of what the SfM's queue holds (50)
 
 
@@ -52,8 +55,13 @@ class KeyframeStream:
         """Notes how many keyframes the SfM is behind: the more, the fewer are chosen."""
         self._selector.limits.relax(min(max((keyframes - UNLOADED_LAG) / (FULL_LAG - UNLOADED_LAG), 0.0), 1.0))
 
-    def answer(self, reports: Iterable[OverlapReport]) -> list[Decision]:
-        """Takes overlap reports of the SfM; returns frames to add (chosen) and to retire (not chosen)."""
+    def answer(self, reports: Iterable[OverlapReport], readout: float = 0.0) -> list[Decision]:
+        """Takes overlap reports and the read-out in use, s; returns frames to add (chosen) and to retire (not chosen).
+
+        With a rolling shutter keyframes are dense in time, while the SfM keeps up.
+        """
+        loaded = self.overlap_min < self._config.overlap_min
+        self._feedback.max_gap = MAX_GAP if readout and not loaded else None
         return self._feedback.answer(reports)
 
     def finish_round(self) -> list[Decision]:

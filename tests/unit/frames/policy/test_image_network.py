@@ -200,17 +200,41 @@ def test_runs_that_overlap_too_much_lose_every_second_keyframe() -> None:
     assert near == set(dense), "the parallax asks for each of them"
 
 
+def test_keyframes_that_are_too_far_apart_in_time_get_frames_between() -> None:
+    walk = steady(10.0, 0.1)  # 0.1 of the image in a second, so that the overlap alone asks for none
+    chosen = walk.stamps[::30]
+    feedback = StreamFeedback(0.5, 1.0, 1e9, walk.sharpest_between)
+    assert play(feedback, walk, chosen)[0] == set(chosen)
+    feedback = StreamFeedback(0.5, 1.0, 1e9, walk.sharpest_between)
+    feedback.max_gap = 10 * PERIOD
+    images, changes = play(feedback, walk, chosen)
+    assert set(chosen) < images
+    assert np.diff(sorted(images)).max() <= feedback.max_gap
+    assert np.diff(sorted(images)).min() > feedback.max_gap // 4
+    assert set(changes.values()) == {1}
+
+
+def test_no_keyframe_is_retired_whose_neighbours_are_too_far_apart_in_time() -> None:
+    walk = steady(10.0, 0.3)
+    dense = walk.stamps[::5]
+    feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between)
+    feedback.max_gap = 9 * PERIOD
+    assert play(feedback, walk, dense)[0] == set(dense)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     steps=st.lists(st.floats(-0.2, 0.2), min_size=60, max_size=150),
     blind=st.frozensets(st.integers(0, 199), max_size=20),
     stride=st.integers(1, 20),
     overlap_min=st.floats(0.5, 0.97),
+    max_gap=st.none() | st.integers(1, 30 * PERIOD),
 )
 def test_nothing_is_added_and_retired_for_ever(
-    steps: list[float], blind: frozenset[int], stride: int, overlap_min: float
+    steps: list[float], blind: frozenset[int], stride: int, overlap_min: float, max_gap: int | None
 ) -> None:
     walk = Walk(np.cumsum(steps), blind)
     feedback = StreamFeedback(overlap_min, overlap_min + 0.025, 1e9, walk.sharpest_between)
+    feedback.max_gap = max_gap
     _, changes = play(feedback, walk, walk.stamps[::stride])
     assert set(changes.values()) <= {1}

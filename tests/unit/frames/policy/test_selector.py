@@ -15,8 +15,9 @@ from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import Decision, Load
 from pipeprog_frames.incoming.decoding import decode_reduced, is_cut_off, reduction
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile, FrameRing
+from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.policy.selector import FrameSelector
-from pipeprog_frames.policy.stream import KeyframeStream
+from pipeprog_frames.policy.stream import MAX_GAP, KeyframeStream
 from pipeprog_frames.tracker import Tracker
 
 WIDTH, HEIGHT = 320, 180
@@ -237,6 +238,24 @@ def test_a_long_4k_stream_stays_in_flat_memory(wall: NDArray[np.uint8]) -> None:
     tracemalloc.stop()
     assert max(peaks) < 16 << 20, "beside the ring, which is one piece: the window and the images being looked at"
     assert max(peaks[2:]) - min(peaks[2:]) < 1 << 20
+
+
+@pytest.mark.parametrize(("readout", "lag", "denser"), [(0.0, 0, False), (0.015, 0, True), (0.015, 25, False)])
+def test_keyframes_are_dense_in_time_for_a_rolling_shutter_that_the_sfm_keeps_up_with(
+    wall: NDArray[np.uint8], readout: float, lag: int, denser: bool
+) -> None:
+    camera = Camera(WIDTH, HEIGHT, 225.0, 225.0, 159.5, 89.5)
+    file = FrameFile()
+    stream = KeyframeStream(FramesConfig(), camera, file.sharpest_between)
+    chosen = []
+    for index in range(60):
+        image, stamp = pan(wall, index), 1 + index * 33_333_333
+        file.add(EncodedFrame(stamp, "camera", cv2.imencode(".jpg", image)[1].tobytes(), camera))
+        chosen += [decision.stamp for decision in stream.consider(stamp, load(image)) if decision.chosen]
+    assert max(np.diff(chosen)) > MAX_GAP
+    stream.lag(lag)
+    reports = [OverlapReport(stamp, True, 0.86, 0.86, 500, 500) for stamp in chosen]
+    assert any(decision.chosen for decision in stream.answer(reports, readout)) == denser
 
 
 def test_the_ring_gives_up_its_oldest_and_the_file_none(wall: NDArray[np.uint8]) -> None:
