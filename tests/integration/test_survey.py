@@ -27,7 +27,7 @@ from std_srvs.srv import Trigger
 
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_msgs.action import Survey
-from pipeprog_msgs.msg import FrameDecision
+from pipeprog_msgs.msg import FrameDecision, SiteProgress
 from pipeprog_node import messages, qos
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
 
@@ -36,6 +36,7 @@ BAG, BOQ, BOARD = (BAGS / f"demo.{end}" for end in ("mcap", "boq.yaml", "board.y
 BOARD_SEEN = slice(3, 19)  # frames from the first that shows the whole board
 COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # the graph is tested here, not its accuracy
 TIMEOUT = 240.0  # s, for whatever takes seconds on an idle machine
+ANSWER = 2.0  # s for the answer to a goal: none comes from a node that is not there
 PERIOD = 0.1  # s between two images
 MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"} | {
     "survey": "pipeprog_bringup.survey.node"
@@ -60,6 +61,8 @@ class Mission:
         self._shown = self._decided = 0  # stamps of the first image of that frame, and of the last decision
         self.node.create_subscription(FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
         self.node.create_timer(PERIOD, self._film)
+        self.progress: list[SiteProgress] = []
+        self.node.create_subscription(SiteProgress, "progress", self.progress.append, qos.latched())
         self.client = ActionClient(self.node, Survey, "survey")
         self.state = self.node.create_client(ChangeState, "survey/change_state")
         self.end = self.node.create_client(Trigger, "survey/end")
@@ -87,6 +90,20 @@ class Mission:
         future = self.client.send_goal_async(Survey.Goal(**goal), lambda heard: self.feedback.append(heard.feedback))
         self.wait_for(future.done)
         return future.result()
+
+    def send_again(self, **goal: str) -> Any:
+        """The handle of a goal that was asked for before: answers get lost while a node is killed."""
+        self.feedback.clear()
+        deadline = time.monotonic() + TIMEOUT
+        while time.monotonic() < deadline:
+            future = self.client.send_goal_async(
+                Survey.Goal(**goal), lambda heard: self.feedback.append(heard.feedback)
+            )
+            waited = time.monotonic() + ANSWER
+            self.wait_for(lambda future=future, waited=waited: future.done() or time.monotonic() > waited)  # type: ignore[misc]
+            if future.done() and future.result().accepted:
+                return future.result()
+        raise AssertionError("refused")
 
     def result(self, handle: Any) -> Any:
         future = handle.get_result_async()
@@ -217,3 +234,28 @@ def test_surveys_come_one_after_another(mission: Mission, nodes: Nodes) -> None:
     assert third.result.reference_covariance.any()
     lives = {pipe["life"] for pipe in json.loads((surveys / "third" / "pipes.json").read_text())["pipes"]}
     assert lives & {pipe["id"] for pipe in written["pipes"]}
+    mission.wait_for(lambda: mission.progress)
+    told = mission.progress[-1]
+    assert (told.earlier, told.later, told.header) == ("first", "third", third.result.pipes.header)
+    assert {name for change in told.pipes for name in change.pipes} == {pipe.id for pipe in third.result.pipes.pipes}
+    assert all(change.counted >= change.length_after - 1e-9 for change in told.pipes)
+
+
+def test_a_survey_goes_on_where_its_own_node_was_killed(mission: Mission, nodes: Nodes) -> None:
+    assert mission.change(Transition.TRANSITION_CONFIGURE)
+    assert mission.change(Transition.TRANSITION_ACTIVATE)
+    assert mission.send(survey_id="killed").accepted
+    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].registered > 2)
+    frames, keyframes = mission.feedback[-1].frames, mission.feedback[-1].keyframes
+    nodes.kill_and_start_again("survey")
+    handle = mission.send_again(survey_id="killed")  # nobody has configured it
+    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].classes)
+    assert mission.feedback[-1].frames > frames
+    assert mission.call(mission.end, Trigger.Request()).success
+    answer = mission.result(handle)
+    assert (answer.status, answer.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")
+    folder = nodes.folder / "killed"
+    assert names(folder) >= REPLAYED
+    assert not list(folder.glob(".pipeprog-*"))
+    bag = Bag.open(folder / "out.mcap")
+    assert bag.image_count == answer.result.sfm.keyframes_seen >= keyframes

@@ -137,6 +137,8 @@ def survey_node(remappings: list) -> LifecycleNode:
         ],
         remappings=remappings,
         output="screen",
+        respawn=True,  # it goes on with a survey, and waits for a lifecycle manager without one
+        respawn_delay=RESPAWN_DELAY,
     )
 
 

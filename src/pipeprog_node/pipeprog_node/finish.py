@@ -19,7 +19,8 @@ _PERIOD = 1.0  # s
 class FinishService:
     """One request at a time: the node is told when it comes, asks whether it is due, and answers it.
 
-    A request while another is pending is refused at once, and so is one whose inputs do not come for PATIENCE seconds:
+    A request while another is pending gets the answer of that one where it expects as many inputs: the client of
+    before may have died. Else it is refused at once, and so is one whose inputs do not come for PATIENCE seconds:
     the number that it expects may be wrong, and nobody else could finish the survey.
     """
 
@@ -53,16 +54,18 @@ class FinishService:
             pending.set_result((outputs, problem))
 
     async def _on_request(self, request: Finish.Request, response: Finish.Response) -> Finish.Response:
-        if self._pending is not None:
+        if self._pending is not None and request.expected_inputs != self._expected:
             response.message = (
                 f"another request is pending, for {self._expected} inputs of which {self._received()} have come: "
                 "wait for its answer"
             )
             return response
-        done = self._pending = Future()
-        self._expected = request.expected_inputs
-        self._seen, self._waited = self._received(), 0.0
-        self._begin()
+        done = self._pending
+        if done is None:
+            done = self._pending = Future()
+            self._expected = request.expected_inputs
+            self._seen, self._waited = self._received(), 0.0
+            self._begin()
         response.outputs, response.message = await done
         response.success = not response.message
         return response

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import stat
@@ -38,6 +39,33 @@ class Record:
 def journal_of(folder: str, name: str) -> Journal | None:
     """The journal that a node of this name keeps in a folder of its survey; None without a folder."""
     return Journal(Path(folder) / f"{name}.journal") if folder else None
+
+
+def written(path: Path) -> Iterator[Any]:
+    """The commands in a journal that another process is writing, in their order; none where it is not there.
+
+    Raises InputError where somebody else may have written it.
+    """
+    try:
+        file = _own(path, os.O_RDONLY, "rb")
+    except FileNotFoundError:
+        return
+    with file, contextlib.suppress(EOFError, pickle.UnpicklingError):  # the last one is not whole yet
+        while True:
+            kind, _, content = pickle.load(file)
+            if kind in (_COMMAND, _WAITING):
+                yield content
+
+
+def _own(path: Path, flags: int, mode: str) -> IO[bytes]:
+    """The file opened: what others may have written is not unpickled, since that could run their code."""
+    number = os.open(path, flags | os.O_NOFOLLOW, stat.S_IRUSR | stat.S_IWUSR)
+    file: IO[bytes] = os.fdopen(number, mode)
+    status = os.fstat(number)
+    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & _OTHERS:
+        file.close()
+        raise InputError(f"{path}: others than this user may have written it: it is not taken for a journal")
+    return file
 
 
 class Journal:
@@ -124,15 +152,9 @@ class Journal:
 
     def _open(self, path: Path) -> None:
         try:
-            # What others may have written is not unpickled: that could run their code.
-            number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, stat.S_IRUSR | stat.S_IWUSR)
-            self._file = os.fdopen(number, "r+b")
+            self._file = _own(path, os.O_RDWR | os.O_CREAT, "r+b")
         except OSError as error:
             raise InputError(f"{path}: the journal of the survey cannot be opened: {error.strerror}") from None
-        status = os.fstat(number)
-        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & _OTHERS:
-            self.close()
-            raise InputError(f"{path}: others than this user may have written it: it is not taken for a journal")
         while True:
             offset = self._file.tell()
             try:

@@ -6,6 +6,7 @@ Whatever the node had of the last survey goes with it, so that nothing of it has
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Collection
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -51,6 +52,7 @@ class RenewableNode:
             problem = str(error)
             self._node = self._make(self._parameters(Renew.Request(idle=True)))
         self._executor.add_node(self._node)
+        gc.collect()  # the old one holds itself in circles, and 10 MB of images; Python looks for them by counts alone
         done.set_result(problem)
 
     def destroy(self) -> None:

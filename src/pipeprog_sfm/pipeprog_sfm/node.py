@@ -177,8 +177,10 @@ class MapOutput:
         self._cameras = node.create_publisher(CameraInfo, REFINED_CALIBRATION, qos.latched())
         self._camera_refined = False
 
-    def publish_overlap(self, header: Header, reports: Sequence[OverlapReport], keyframes: int, retired: int) -> None:
-        """Overlap after so far considered `keyframes` and `retired` messages of retirement."""
+    def publish_overlap(
+        self, header: Header, reports: Sequence[OverlapReport], keyframes: int, retired: int, readout: float
+    ) -> None:
+        """Overlap after so far considered `keyframes` and `retired` messages of retirement; read-out in use, s."""
         images = [
             msg.ImageOverlap(
                 stamp=messages.time_msg(report.stamp),
@@ -194,7 +196,11 @@ class MapOutput:
         ]
         self._overlap.publish(
             msg.ImageOverlapArray(
-                header=header, keyframes_considered=keyframes, retirements_considered=retired, images=images
+                header=header,
+                keyframes_considered=keyframes,
+                retirements_considered=retired,
+                images=images,
+                readout=readout,
             )
         )
 
@@ -439,7 +445,8 @@ class SfmNode(Node):
         self._publish_overlap(reports, messages.header(retirement.stamp, retirement.frame_id))
 
     def _publish_overlap(self, reports: Sequence[OverlapReport], header: Header) -> None:
-        self._output.publish_overlap(header, reports, self._done + self._dropped, self._retired)
+        done = self._done + self._dropped
+        self._output.publish_overlap(header, reports, done, self._retired, self._status.readout)
 
     def _publish_new_motion(self) -> None:
         if self._motion_published < self._motion.considered:

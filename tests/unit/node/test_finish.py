@@ -50,9 +50,10 @@ def stage() -> Iterator[Stage]:
     rclpy.shutdown()
 
 
-def test_a_second_request_is_refused_while_one_is_pending(stage: Stage) -> None:
+def test_a_second_request_for_other_inputs_is_refused_while_one_is_pending(stage: Stage) -> None:
     first = stage.call(3)
     stage.spin_until(lambda: stage.service.expected == 3)
+    again = stage.call(3)  # of a client that has taken the place of the first
     second = stage.call(7)
     stage.spin_until(second.done)
     assert not second.result().success
@@ -62,8 +63,9 @@ def test_a_second_request_is_refused_while_one_is_pending(stage: Stage) -> None:
     stage.received = 3
     assert stage.service.is_due
     stage.service.answer(5)
-    stage.spin_until(first.done)
-    assert (first.result().success, first.result().outputs) == (True, 5)
+    for same in (first, again):
+        stage.spin_until(same.done)
+        assert (same.result().success, same.result().outputs) == (True, 5)
     assert stage.service.expected is None
     third = stage.call(1)
     stage.spin_until(lambda: stage.service.is_due)

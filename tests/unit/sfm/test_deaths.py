@@ -43,7 +43,7 @@ class Replay:
         monkeypatch.setattr(
             self.node._output,
             "publish_overlap",
-            lambda header, reports, keyframes, retired: self.answers.append((keyframes, retired)),
+            lambda header, reports, keyframes, retired, readout: self.answers.append((keyframes, retired)),
         )
         self.node._on_event(Ready())
 

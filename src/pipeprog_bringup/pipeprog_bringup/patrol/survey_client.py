@@ -22,7 +22,10 @@ from pipeprog_node import messages
 
 ANSWER_SECONDS = 10.0  # for an answer of the node survey: it computes nothing itself
 START_SECONDS = 900.0  # until a goal is accepted: a survey of before may be worked off still, 5 minutes for a field
-GONE_SECONDS = 30.0  # without the node, until its survey is given up: a supervisor starts it anew within seconds
+# s without feedback, of which two a second come: then the node was killed. A server that was killed stays in the
+# graph for the 20 s of its lease, and the one that follows is there before.
+SILENT_SECONDS = 10.0
+GONE_SECONDS = 30.0  # from then on, until the survey is given up: a supervisor starts the node anew within seconds
 # s from finding a server to the first goal: it must have found this client, too, or its answer is lost (rclpy#1123).
 MATCHING_SECONDS = 1.0
 PAUSE = 1.0  # s between two goals, while none is accepted
@@ -45,6 +48,7 @@ class SurveyClient:
         self._action = ActionClient(node, Survey, name)
         self._end = node.create_client(Trigger, f"{name}/end")
         self._matched: set[ActionClient] = set()
+        self._goal, self._heard = Survey.Goal(), 0.0  # the goal, and when its survey was last heard of
         self._handle: ClientGoalHandle | None = None
         self._result: Future | None = None
 
@@ -58,9 +62,9 @@ class SurveyClient:
     ) -> None:
         """Begins a survey, fields as of its goal; raises InputError where the node does not accept it."""
         files = {"boq": boq, "board": board, "reference": reference}
-        goal = Survey.Goal(survey_id=survey_id, time_limit=messages.duration_msg(seconds), **files)
+        self._goal = Survey.Goal(survey_id=survey_id, time_limit=messages.duration_msg(seconds), **files)
         deadline = time.monotonic() + self._start_seconds
-        while not self._accepted(goal):
+        while not self._accepted(self._goal):
             if time.monotonic() + PAUSE > deadline:
                 raise InputError(
                     f"the node {self._name} has accepted no goal for {self._start_seconds:g} s: is it active "
@@ -83,17 +87,33 @@ class SurveyClient:
             self.wait(self._handle.cancel_goal_async().done, ANSWER_SECONDS)
 
     def result(self) -> Surveyed:
-        """Waits for the result of the survey that was started."""
+        """Waits for the result of the survey that was started.
+
+        A node that is started anew goes on with a survey; the goal is sent to it once more, if the survey has a name.
+        """
         assert self._result is not None
-        while not self._result.done():
-            self.wait(lambda: self.is_over or not self._action.server_is_ready(), PAUSE)
-            if not self.is_over and not self.wait(self._action.server_is_ready, GONE_SECONDS):
+        began = time.monotonic()  # nothing is heard while nobody waits
+        while not self.wait(lambda: self.is_over, PAUSE):
+            is_silent = time.monotonic() > max(self._heard, began) + SILENT_SECONDS
+            if is_silent and not self._is_taken_up():
                 self._result = None
                 return Surveyed(False, f"the node {self._name} is gone, and its survey with it", "")
         answer = self._result.result()
         succeeded = answer.status == GoalStatus.STATUS_SUCCEEDED
         error = answer.result.error_msg or ("" if succeeded else "the survey was cancelled")
         return Surveyed(succeeded, error, answer.result.folder)
+
+    def _is_taken_up(self) -> bool:
+        """Whether the survey goes on: it is heard of again, or the node takes the goal once more."""
+        self._matched.discard(self._action)
+        silent, deadline = self._heard, time.monotonic() + GONE_SECONDS
+        while time.monotonic() < deadline and self._heard == silent and not self.is_over:
+            if self._goal.survey_id and self._accepted(self._goal):
+                assert self._handle is not None
+                self._result = self._handle.get_result_async()
+                return True
+            self.wait(lambda: self.is_over or self._heard > silent, PAUSE)
+        return self._heard > silent or self.is_over
 
     def drive(self, action: ActionClient, goal: Any, seconds: float) -> Any:
         """The result of an action of the same node that moves the robot, while the survey goes on.
@@ -147,8 +167,11 @@ class SurveyClient:
         sent = self._action.send_goal_async(goal, self._on_feedback)
         if not self.wait(sent.done, ANSWER_SECONDS):
             return False
-        self._handle = sent.result()
-        return self._handle is not None and self._handle.accepted
+        handle = sent.result()
+        if handle is None or not handle.accepted:
+            return False
+        self._handle, self._heard = handle, time.monotonic()
+        return True
 
     def _on_feedback(self, heard: Survey.Impl.FeedbackMessage) -> None:
-        self.feedback = heard.feedback
+        self.feedback, self._heard = heard.feedback, time.monotonic()

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter, defaultdict, deque
 from dataclasses import replace
 
 from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_frames.frame_decision import FAULTS
+from pipeprog_node.journal import Journal
 
 LOST_AFTER = 3  # keyframes in a row without a place in the map: one may be blurred, two may be its neighbours
 
@@ -112,9 +114,14 @@ class FrameLog:
 class LiveFrameLog(FrameLog):
     """The frames of a camera: nobody says that one was sent, so it is known by its first decision."""
 
-    def __init__(self) -> None:
+    def __init__(self, journal: Journal | None = None) -> None:
+        """`journal`: where decisions are kept, and those of a process before this one are."""
         super().__init__()
+        self._journal: Journal | None = None
         self._last_keyframes: deque[int] = deque(maxlen=LOST_AFTER)
+        for _, row in journal.commands() if journal is not None else ():
+            self.decide(row)
+        self._journal = journal
 
     @property
     def is_tracking(self) -> bool:
@@ -124,6 +131,9 @@ class LiveFrameLog(FrameLog):
 
     def decide(self, row: FrameRow) -> None:
         """A decision came; a second one about the same frame replaces the first."""
+        if self._journal is not None:
+            with contextlib.suppress(OSError):  # the disk is full: the survey ends by that
+                self._journal.write(self._journal.end, row)
         if row.stamp not in self._first:
             self.play(row.stamp)
         if row.chosen and row.stamp not in self._last_keyframes:

@@ -20,6 +20,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.json_file import read_json
 
 _STAGE_PREFIX = ".pipeprog-"
+JOURNAL = "journal"  # folder among the new files that is no result: it is there until these have their names
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -32,20 +33,21 @@ class OutputFolder:
     earlier run are replaced at that moment and not before; files that pipeprog did not write stay where they are.
     """
 
-    def __init__(self, path: Path, force: bool = False) -> None:
+    def __init__(self, path: Path, force: bool = False, left: Path | None = None) -> None:
+        """`left`: the hidden folder of a run that was killed, which this one goes on with; see `left_behind`."""
         self.path = path
         self._force = force
+        self._left = left
         self._made: list[Path] = []
         self._stage = path
         self._lock = -1
 
     def __enter__(self) -> OutputFolder:
         try:
-            self._make_folders()
-            self._remove_leftovers()
-            if not self._force and any(self.path.iterdir()):
-                raise InputError(f"{self.path} is not empty: choose another --out, or replace its results with --force")
-            self._stage = Path(tempfile.mkdtemp(prefix=_STAGE_PREFIX, dir=self.path))
+            if self._left is None:
+                self._make_stage()
+            else:
+                self._stage = self._left
             self._lock = locked(self._stage)
             self._stage.joinpath(".probe").write_bytes(bytes(4096))
             self._stage.joinpath(".probe").unlink()
@@ -63,7 +65,8 @@ class OutputFolder:
 
     def names(self) -> list[str]:
         """The files written so far, relative to the folder."""
-        return sorted(str(file.relative_to(self._stage)) for file in self._stage.rglob("*") if file.is_file())
+        files = [file.relative_to(self._stage) for file in self._stage.rglob("*") if file.is_file()]
+        return sorted(str(file) for file in files if file.parts[0] != JOURNAL)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -78,6 +81,13 @@ class OutputFolder:
             self._discard(keep_folder=error is None)
         if isinstance(error, OSError) and error.errno in _FULL:
             raise _explained(self.path, error) from None
+
+    def _make_stage(self) -> None:
+        self._make_folders()
+        self._remove_leftovers()
+        if not self._force and any(self.path.iterdir()):
+            raise InputError(f"{self.path} is not empty: choose another --out, or replace its results with --force")
+        self._stage = Path(tempfile.mkdtemp(prefix=_STAGE_PREFIX, dir=self.path))
 
     def _make_folders(self) -> None:
         if self.path.exists() and not self.path.is_dir():
@@ -141,6 +151,14 @@ class OutputFolder:
             for folder in reversed(self._made):
                 with contextlib.suppress(OSError):
                     folder.rmdir()
+
+
+def left_behind(path: Path) -> Iterator[Path]:
+    """The hidden folders that killed runs have left in the folder `path`; those of runs that still write, without."""
+    for stage in path.glob(f"{_STAGE_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            os.close(locked(stage))
+            yield stage
 
 
 @contextlib.contextmanager

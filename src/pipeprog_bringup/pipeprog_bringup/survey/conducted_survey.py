@@ -11,18 +11,20 @@ from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
+from pipeprog_bringup.playback.frame_log import LiveFrameLog
 from pipeprog_bringup.playback.listener import LastMessages
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.survey.alignment_result import note_alignment
 from pipeprog_bringup.survey.goal import Goal
 from pipeprog_bringup.survey.missing_input import PATIENCE
 from pipeprog_bringup.survey.passage import Cancelled, Passage, SurveyFailure
+from pipeprog_bringup.survey.survey_journal import SurveyJournal
 from pipeprog_bringup.survey.survey_output import SurveyOutput
+from pipeprog_bringup.survey.waiting_client import Client
 from pipeprog_camera.errors import InputError
 from pipeprog_msgs.action import Survey
 from pipeprog_node import messages, qos
@@ -40,25 +42,28 @@ class ConductedSurvey:
     def __init__(
         self,
         node: Node,
-        handle: ServerGoalHandle,
+        client: Client,
         goal: Goal,
         output: SurveyOutput,
+        journal: SurveyJournal,
         tick: Callable[[], Awaitable[None]],
         is_end_asked: Callable[[], bool],
         lack: Callable[[], str],
     ) -> None:
         """`node` is this survey's alone; `tick` waits for a moment.
 
-        `is_end_asked`: filming is to end; `lack`: why no images come, empty: not known.
+        `is_end_asked`: filming is to end; `lack`: why no images come, empty: not known. Where `journal` tells of a
+        process that was killed, the survey goes on from there.
         """
-        self._handle, self._goal, self._output = handle, goal, output
+        self._client, self._goal, self._output, self._journal = client, goal, output, journal
         self._wait, self._is_end_asked, self._lack = tick, is_end_asked, lack
         self._started = self._told = self._looked = time.monotonic()
         self._stopped = False  # a cancel is heard until it is obeyed
         self._is_full = False
         self._considered, self._decided = 0, math.inf  # images decided on, and when the last of them came
         self._missing = ""
-        self._passage = Passage(node, self._tick, lambda: handle.is_cancel_requested and not self._stopped)
+        log = LiveFrameLog(journal.frames)
+        self._passage = Passage(node, self._tick, lambda: client.is_cancel_requested and not self._stopped, log)
         depth = qos.reliable(DEPTH)
         node.create_subscription(CompressedImage, IMAGES, self._keep_image, depth, raw=True)
         node.create_subscription(CameraInfo, CALIBRATIONS, self._keep_calibration, depth)
@@ -69,11 +74,21 @@ class ConductedSurvey:
         passage, settings = self._passage, {}
         survey: LastMessages | None = None
         try:
-            await passage.begin(self._goal, self._output.colmap, self._output.journal)
+            await self._begin()
             settings = await passage.settings()
-            filming = time.monotonic()
-            limit = self._goal.time_limit or math.inf
-            await passage.film(lambda: self._is_end_asked() or self._is_full or time.monotonic() - filming > limit)
+            progress, limit = self._journal.progress, self._goal.time_limit or math.inf
+            progress.filming = progress.filming or time.monotonic()
+            self._journal.note()
+            await passage.film(
+                lambda: (
+                    progress.is_filmed
+                    or self._is_end_asked()
+                    or self._is_full
+                    or time.monotonic() - progress.filming > limit
+                )
+            )
+            progress.is_filmed = True
+            self._journal.note()
             survey = await passage.work_off()
         except SurveyFailure as failure:
             result.error_code, result.error_msg = failure.code, str(failure)
@@ -85,6 +100,16 @@ class ConductedSurvey:
         await self._written(result, survey or passage.maps.newest, settings)
         await self._at_rest()
         return result
+
+    async def _begin(self) -> None:
+        """Lets the nodes begin, or goes on where they have."""
+        passage, progress = self._passage, self._journal.progress
+        if progress.begun:
+            await passage.go_on(progress.begun)
+            return
+        self._journal.forget_nodes()
+        progress.begun = await passage.begin(self._goal, self._output.colmap, self._output.journal)
+        self._journal.note()
 
     async def _written(self, result: Survey.Result, survey: LastMessages | None, settings: dict[str, Any]) -> None:
         """Writes what there is and notes it in the result; without a frame there is nothing."""
@@ -124,9 +149,10 @@ class ConductedSurvey:
         now = time.monotonic()
         if now - self._told >= FEEDBACK_PERIOD:
             self._told = now
-            self._handle.publish_feedback(self._feedback(now - self._started))
+            self._client.publish_feedback(self._feedback(now - self._started))
         if now - self._looked >= ROOM_PERIOD:
             self._looked = now
+            self._journal.live()
             self._look_for_input(now)
             self._is_full = self._is_full or not self._output.has_room
         await self._wait()
@@ -190,7 +216,7 @@ class ConductedSurvey:
             "frames_considered": passage.log.considered,
             "keyframes": passage.log.chosen,
             "registered": status.keyframes_registered,
-            "cancelled": bool(self._handle.is_cancel_requested),
+            "cancelled": self._client.is_cancel_requested,
             "notes": [text for text in (status.calibration, status.message) if text],
             "losses": passage.log.faults(),
             "seeds": {name: values["seed"] for name, values in settings.items() if "seed" in values},

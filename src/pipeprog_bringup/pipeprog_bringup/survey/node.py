@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import gc
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,18 +15,24 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from pipeprog_bringup.survey.conducted_survey import ConductedSurvey
 from pipeprog_bringup.survey.goal import check_goal, read_reference, read_site
 from pipeprog_bringup.survey.missing_input import missing_input
+from pipeprog_bringup.survey.progress import site_progress
 from pipeprog_bringup.survey.robot_input import RobotInput
+from pipeprog_bringup.survey.survey_journal import unfinished
 from pipeprog_bringup.survey.survey_output import SurveyOutput
+from pipeprog_bringup.survey.waiting_client import Client
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import for_terminal
 from pipeprog_msgs.action import Survey
-from pipeprog_node import messages
+from pipeprog_msgs.msg import SiteProgress
+from pipeprog_node import messages, qos
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare_fixed
 
@@ -43,7 +51,8 @@ class SurveyNode(LifecycleNode):
         self._results = Path(declare_fixed(self, "results", "surveys", "folder that each survey gets a folder in"))
         self._record = declare_fixed(self, "record", False, "keep the images of each survey as recording.mcap")
         self._cameras = declare_fixed(self, "cameras", "", "of a rig, as of frames: whose images are kept").split()
-        self._running: ServerGoalHandle | None = None
+        self._running: Client | None = None
+        self._left = unfinished(self._results)
         self._is_active = self._end_asked = False
         self._waiting: list[Future] = []
         group = ReentrantCallbackGroup()  # while a survey waits, the other callbacks must run
@@ -57,10 +66,12 @@ class SurveyNode(LifecycleNode):
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             result_timeout=RESULT_TIMEOUT,
         )
+        self._progress = self.create_publisher(SiteProgress, "progress", qos.latched())
         self._end = self.create_service(Trigger, "~/end", self._on_end, callback_group=group)
         # Steady time: a paused recording stops ROS time.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(TICK, self._wake, callback_group=group, clock=steady)
+        self._taking_up = self.create_timer(TICK, self._take_up, callback_group=group, clock=steady)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reads the files that the parameters name, so that a mistake is known before the robot walks."""
@@ -73,8 +84,12 @@ class SurveyNode(LifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Goals are accepted."""
+        """Goals are accepted; a survey whose node was killed a moment ago goes on."""
         self._is_active = True
+        left, self._left = self._left, None
+        if left is not None and self._running is None:
+            request = deserialize_message(left.goal, Survey.Goal)
+            self.executor.create_task(self._run, Client(request.survey_id, None), request, left.folder)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -83,10 +98,17 @@ class SurveyNode(LifecycleNode):
         self._end_asked = True
         return super().on_deactivate(state)
 
+    def _take_up(self) -> None:
+        """Becomes active where a survey is to go on: it was active when the process before was killed."""
+        self._taking_up.cancel()
+        if self._left is not None:
+            self.get_logger().warning(f"the survey {self._left.folder.parent.name} goes on")
+            self.trigger_configure()
+            self.trigger_activate()
+
     def _on_goal(self, request: Survey.Goal) -> GoalResponse:
-        if not self._is_active or self._running is not None:
-            return GoalResponse.REJECT
-        return GoalResponse.ACCEPT
+        is_free = self._running is None or self._running.is_of(request)
+        return GoalResponse.ACCEPT if self._is_active and is_free else GoalResponse.REJECT
 
     def _on_end(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self._running is not None
@@ -95,18 +117,16 @@ class SurveyNode(LifecycleNode):
         return response
 
     async def _execute(self, handle: ServerGoalHandle) -> Survey.Result:
-        if self._running is not None:  # two goals came before one was executed
+        request: Survey.Goal = handle.request
+        client = self._running
+        if client is None:
+            result = await self._run(Client("", handle), request)
+        elif client.is_of(request):
+            client.handle = handle
+            result = await client.result
+        else:  # two goals came before one was executed
             handle.abort()
             return Survey.Result(error_code=Survey.Result.GOAL_REJECTED, error_msg="another survey is running")
-        self._running, self._end_asked = handle, False
-        started = time.monotonic()
-        try:
-            result = await self._conducted(handle)
-        finally:
-            self._running = None
-        result.total_elapsed_time = messages.duration_msg(time.monotonic() - started)
-        if result.error_msg:
-            self.get_logger().error(for_terminal(result.error_msg))
         if handle.is_cancel_requested:
             handle.canceled()
         elif result.pipes.map_revision and result.error_code in USABLE:
@@ -115,15 +135,31 @@ class SurveyNode(LifecycleNode):
             handle.abort()
         return result
 
-    async def _conducted(self, handle: ServerGoalHandle) -> Survey.Result:
-        request: Survey.Goal = handle.request
+    async def _run(self, client: Client, request: Survey.Goal, left: Path | None = None) -> Survey.Result:
+        """The result of a survey from its beginning, or from where a process that was killed has `left` it."""
+        self._running, self._end_asked = client, False
+        started = time.monotonic()
+        try:
+            result = await self._conducted(client, request, left)
+        finally:
+            self._running = None
+        gc.collect()  # its node and messages hold each other in circles, which Python looks for by counts of objects
+        result.total_elapsed_time = messages.duration_msg(time.monotonic() - started)
+        if result.error_msg:
+            self.get_logger().error(for_terminal(result.error_msg))
+        client.result.set_result(result)
+        return result
+
+    async def _conducted(self, client: Client, request: Survey.Goal, left: Path | None) -> Survey.Result:
         try:
             site = read_site(request.boq or self._boq, request.board or self._board)
             limit = messages.seconds(request.time_limit)
             goal = check_goal(request.survey_id, site, limit, self.get_clock().now().nanoseconds)
             if request.reference:
                 goal = replace(goal, reference=read_reference(request.reference, self._results))
-            output = SurveyOutput(self._results, goal, self._record)
+            client.name = request.survey_id = goal.name
+            output = SurveyOutput(self._results, goal, self._record, left)
+            journal = output.journal_of(serialize_message(request))
         except InputError as error:
             return Survey.Result(error_code=Survey.Result.BAD_INPUT, error_msg=str(error))
         # A node of this survey alone: with it goes all that was subscribed.
@@ -132,12 +168,29 @@ class SurveyNode(LifecycleNode):
         robot = RobotInput(self, output, self._cameras) if self._record else None
         try:
             ended, lack = (lambda: self._end_asked), (lambda: missing_input(self, self._cameras))
-            return await ConductedSurvey(listener, handle, goal, output, self._tick, ended, lack).run()
+            survey = ConductedSurvey(listener, client, goal, output, journal, self._tick, ended, lack)
+            result = await survey.run()
         finally:
+            journal.close()
             if robot is not None:
                 robot.close()
             self.executor.remove_node(listener)
             listener.destroy_node()
+        if goal.reference is not None and result.folder and result.error_code == Survey.Result.NONE:
+            folders = goal.reference.path.parent, Path(result.folder)
+            self.executor.create_task(self._publish_progress, *folders, result.pipes.header)
+        return result
+
+    async def _publish_progress(self, earlier: Path, later: Path, header: Header) -> None:
+        """Tells what has changed since the reference: it takes seconds, for which no result waits."""
+        with ThreadPoolExecutor(1) as pool:
+            told = pool.submit(site_progress, earlier, later, header)
+            while not told.done():
+                await self._tick()
+        try:
+            self._progress.publish(told.result())
+        except InputError as error:
+            self.get_logger().warning(f"no progress since {earlier.name}: {for_terminal(str(error))}")
 
     async def _tick(self) -> None:
         future = Future()

@@ -65,11 +65,13 @@ class Passage:
         stage: one of Survey.Feedback.
     """
 
-    def __init__(self, node: Node, tick: Callable[[], Awaitable[None]], is_cancelled: Callable[[], bool]) -> None:
+    def __init__(
+        self, node: Node, tick: Callable[[], Awaitable[None]], is_cancelled: Callable[[], bool], log: LiveFrameLog
+    ) -> None:
         """`node` is this survey's alone; `tick` waits for a moment in which the node's callbacks run."""
         self._node, self._tick, self._is_cancelled = node, tick, is_cancelled
         self._watchdog = Watchdog()
-        self.log = LiveFrameLog()
+        self.log = log
         self.listener = Listener(node, self.log, self._watchdog)
         self.maps = MapListener(node)
         self.stage = Survey.Feedback.STARTING
@@ -81,10 +83,16 @@ class Passage:
         self._lives = dict.fromkeys(CONFIGS, 0)  # times that each has taken it up
         self._map_asked: int | None = None  # keyframes of the map that has been made; None: not yet
 
-    async def begin(self, goal: Goal, colmap: Path, journal: Path) -> None:
+    async def begin(self, goal: Goal, colmap: Path, journal: Path) -> dict[str, dict[str, Any]]:
         """Lets each node forget the survey before, the one that films last; raises SurveyFailure.
 
-        `colmap`: folder of the sparse model; `journal`: of what the nodes write down.
+        Args:
+            goal: what is asked for.
+            colmap: folder of the sparse model.
+            journal: folder of what the nodes write down.
+
+        Returns:
+            How each node has begun, for `go_on`.
         """
         folder = str(journal.resolve())
         await self._renewed("frames", idle=True)  # what it keeps for nodes that come late is of the survey before
@@ -93,6 +101,12 @@ class Passage:
         reference = str(goal.reference.path) if goal.reference else ""
         await self._begin("sfm", board=board, colmap=str(colmap.resolve()), reference=reference, journal=folder)
         await self._begin("frames", idle=False, journal=folder)
+        await self._until(self._is_connected, DELIVERY_SECONDS, "the nodes have not found each other")
+        return self._begun
+
+    async def go_on(self, begun: dict[str, dict[str, Any]]) -> None:
+        """Takes a survey up whose node `survey` was killed, while the others went on."""
+        self._begun = begun
         await self._until(self._is_connected, DELIVERY_SECONDS, "the nodes have not found each other")
 
     async def film(self, is_over: Callable[[], bool]) -> None:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import shutil
 from pathlib import Path
 from typing import Any
 
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from pipeprog_bringup.playback.frame_log import FrameLog
@@ -21,12 +23,15 @@ from pipeprog_bringup.playback.survey_writer import (
 )
 from pipeprog_bringup.recording.bag_writer import BagWriter
 from pipeprog_bringup.results import result_files
-from pipeprog_bringup.results.atomic_output import OutputFolder
+from pipeprog_bringup.results.atomic_output import JOURNAL, OutputFolder
 from pipeprog_bringup.results.plan_file import write_plan
 from pipeprog_bringup.survey.goal import Goal
+from pipeprog_bringup.survey.survey_journal import SurveyJournal
 from pipeprog_camera.errors import InputError
+from pipeprog_frames.incoming.frame_buffer import EncodedFrame
 from pipeprog_msgs import msg
 from pipeprog_node import messages
+from pipeprog_node.journal import written
 
 MIN_FREE = 1 << 30  # bytes; 1 GiB: the results of a field of 58 pipes take 0.4 GB, cloud and keyframes included
 
@@ -39,12 +44,15 @@ class SurveyOutput:
         journal: folder for what the nodes write down for the case that they are killed; it ends with the survey.
     """
 
-    def __init__(self, results: Path, goal: Goal, record: bool) -> None:
-        """Raises InputError where the folder has another survey's files, or no room."""
+    def __init__(self, results: Path, goal: Goal, record: bool, left: Path | None = None) -> None:
+        """`left`: the hidden folder of this survey, where the process that conducted it was killed.
+
+        Raises InputError where the folder has another survey's files, or no room.
+        """
         self.path = results / goal.name
         self._goal = goal
         self._open = contextlib.ExitStack()
-        self._folder = self._open.enter_context(OutputFolder(self.path))
+        self._folder = self._open.enter_context(OutputFolder(self.path, left=left))
         if not self.has_room:
             self.discard()
             raise InputError(
@@ -53,19 +61,32 @@ class SurveyOutput:
         self._recording = self._bag("out.mcap")
         version = result_files.package_version("pipeprog") or "unknown"
         self._recording.describe({"site": goal.site.boq_path.stem, "survey": goal.name, "pipeprog": version})
-        self._input = self._bag("recording.mcap") if record else None
+        self._input = self._bag(self._new_name("recording", "mcap")) if record else None
+        self._images: set[int] = set()  # stamps of the keyframes that are written
         self._infos: dict[int, CameraInfo] = {}  # of the keyframes, by stamp
-        self.journal = self._folder.file("journal")
-        self.journal.mkdir()
+        self.journal = self._folder.file(JOURNAL)
+        self.journal.mkdir(exist_ok=True)
+        self._is_taken_up = left is not None
 
     @property
     def colmap(self) -> Path:
         """Where the sparse model goes."""
         return self._folder.file("colmap")
 
+    def journal_of(self, goal: bytes) -> SurveyJournal:
+        """What the node `survey` writes down itself; raises InputError, with nothing left."""
+        try:
+            return SurveyJournal(self.journal, goal)
+        except InputError:
+            self.discard()
+            raise
+
     def keep_image(self, image: CompressedImage, data: bytes) -> None:
         """Writes the image of a keyframe into out.mcap; `data`: the message as it came, in CDR."""
         stamp = messages.stamp_ns(image.header.stamp)
+        if stamp in self._images:
+            return
+        self._images.add(stamp)
         self._recording.write("/keyframes/image/compressed", type_name(CompressedImage), data, stamp)
 
     def keep_calibration(self, info: CameraInfo) -> None:
@@ -84,7 +105,8 @@ class SurveyOutput:
 
         `about`: what config.yaml and run.json are to say, under `config` and `run`.
         """
-        shutil.rmtree(self.journal, ignore_errors=True)
+        if self._is_taken_up:
+            self._keep_filmed()
         if survey is not None:
             record_survey(self._recording, survey, status)
             cameras = record_cameras(self._recording, survey, self._infos)
@@ -108,6 +130,22 @@ class SurveyOutput:
     def has_room(self) -> bool:
         """Whether the disk has room for what a survey writes at its end."""
         return shutil.disk_usage(self.path).free >= MIN_FREE
+
+    def _keep_filmed(self) -> None:
+        """Writes the keyframes that no message has brought: the selector's journal has all that were published.
+
+        It is read at the end, for none is to be lost between the start of this process and its first message.
+        """
+        for change in written(self.journal / "frames.journal"):
+            if isinstance(change, EncodedFrame):
+                image = messages.compressed_image(change.stamp, change.frame_id, change.encoded)
+                self.keep_image(image, serialize_message(image))
+                self.keep_calibration(messages.info_from_camera(change.camera, change.stamp, change.frame_id))
+
+    def _new_name(self, stem: str, ending: str) -> str:
+        """NAME.ending, or NAME_2.ending, ... after a process that was killed."""
+        names = (f"{stem}{f'_{number}' if number > 1 else ''}.{ending}" for number in itertools.count(1))
+        return next(name for name in names if not self._folder.file(name).exists())
 
     def _bag(self, name: str) -> BagWriter:
         stream = self._open.enter_context(self._folder.file(name).open("wb"))

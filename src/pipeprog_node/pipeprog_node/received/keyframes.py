@@ -12,6 +12,7 @@ from pipeprog_camera.limits import (
 from pipeprog_msgs.msg import ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_node.intake import InvalidMessageError
 from pipeprog_node.received.header import checked_stamp, stamp_and_frame
+from pipeprog_node.received.readout import checked_readout
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,16 @@ class ReceivedOverlap:
 
 @dataclass(frozen=True)
 class ReceivedOverlaps:
-    """One answer of the SfM: stamp [ns] of the newest keyframe it has considered, counts, overlaps that changed."""
+    """One answer of the SfM: stamp [ns] of the newest keyframe it has considered, counts, overlaps that changed.
+
+    readout: of the rolling shutter in use, s; 0: none, or none known yet.
+    """
 
     stamp: int
     keyframes: int
     retirements: int
     images: tuple[ReceivedOverlap, ...]
+    readout: float = 0.0
 
 
 def retirement(message: KeyframesRetired) -> ReceivedRetirement:
@@ -60,7 +65,7 @@ def retirement(message: KeyframesRetired) -> ReceivedRetirement:
 
 
 def image_overlaps(message: ImageOverlapArray) -> ReceivedOverlaps:
-    """Overlaps from 0 to 1, of no more keyframes than a survey can reach."""
+    """Overlaps from 0 to 1, of no more keyframes than a survey can reach, and a read-out that a camera has."""
     stamp, _ = stamp_and_frame(message.header)
     counts = message.keyframes_considered, message.retirements_considered, len(message.images)
     if max(counts) > MAX_POSES:
@@ -69,7 +74,8 @@ def image_overlaps(message: ImageOverlapArray) -> ReceivedOverlaps:
             "an answer to {} keyframes and {} retirements with the overlaps of {}".format(*counts)
             + f": {MAX_POSES} at most are taken",
         )
-    return ReceivedOverlaps(stamp, *counts[:2], tuple(_overlap(image) for image in message.images))
+    readout = checked_readout(message.readout)
+    return ReceivedOverlaps(stamp, *counts[:2], tuple(_overlap(image) for image in message.images), readout)
 
 
 def _overlap(image: ImageOverlap) -> ReceivedOverlap:

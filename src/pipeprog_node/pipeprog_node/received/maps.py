@@ -19,11 +19,11 @@ from pipeprog_camera.limits import (
     MAX_POSES,
     MAX_VELOCITY,
 )
-from pipeprog_camera.rolling_shutter import check_readout
 from pipeprog_msgs.msg import KeyframeVelocities, SfmStatus
 from pipeprog_node import messages
 from pipeprog_node.intake import InvalidMessageError
 from pipeprog_node.received.header import checked_stamp, stamp_and_frame
+from pipeprog_node.received.readout import checked_readout
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def keyframe_poses(message: Path) -> ReceivedPoses:
 def keyframe_velocities(message: KeyframeVelocities) -> ReceivedVelocities:
     """Finite velocities within MAX_VELOCITY, and a read-out that a rolling shutter can have."""
     stamp, _ = stamp_and_frame(message.header)
-    _check_readout(message.readout)
+    checked_readout(message.readout)
     if message.readout == 0.0:
         raise InvalidMessageError("read-out", "velocities with a read-out of 0 s: a global shutter needs none")
     if len(message.velocities) > MAX_POSES:
@@ -154,13 +154,6 @@ def keyframe_velocities(message: KeyframeVelocities) -> ReceivedVelocities:
     return ReceivedVelocities(stamp, message.readout, linear, angular)
 
 
-def _check_readout(readout: float) -> None:
-    try:
-        check_readout(readout)
-    except InputError as error:
-        raise InvalidMessageError("read-out", str(error)) from None
-
-
 def sfm_status(message: SfmStatus) -> ReceivedStatus:
     """Number and scale of the last map; a map has a scale with a standard deviation."""
     stamp_and_frame(message.header)
@@ -173,7 +166,7 @@ def sfm_status(message: SfmStatus) -> ReceivedStatus:
         )
     if message.map_revision and not 0.0 <= message.scale_sigma < np.inf:
         raise InvalidMessageError("scale", f"scale_sigma is {message.scale_sigma:g}: a map has one, zero or larger")
-    _check_readout(message.readout)
+    checked_readout(message.readout)
     return ReceivedStatus(
         stamp,
         message.map_revision,

@@ -23,6 +23,7 @@ MIN_REACH, MAX_REACH = 1.5, 4.0  # px of a profile to both sides of the edge: th
 REACH = 0.6  # of the semi-minor axis, likewise: a profile must not reach the disc's opposite edge
 EDGE_HALF_WIDTH = 1.8  # px around the steepest place that count as the edge: two sigma of a blur of 0.9 px
 MIN_EDGE_SHARE = 0.6  # of all falls of grey along a profile, within the edge: texture has several
+MAX_BLUR = 2.4  # px, sigma of an edge of whose fall, as far as MAX_REACH, that share lies within EDGE_HALF_WIDTH
 MAX_AREA_ERROR = 0.1  # relative, of a contour's area against its ellipse's ...
 AREA_ERROR_PX = 0.5  # ... and px of its semi-minor axis: the staircase of pixels
 REJECTION = 3.0  # robust standard deviations of an edge point from its ellipse, plus 0.02 px of interpolation

@@ -31,6 +31,7 @@ class FakeRobot(Node):
         said: goals, ends and moves in their order.
         failing: error messages of the next surveys, one each; an empty one succeeds.
         blocked: waypoints that are not reached.
+        is_killed: whether nothing is heard of the first survey; the next one ends at once.
     """
 
     def __init__(self) -> None:
@@ -38,7 +39,7 @@ class FakeRobot(Node):
         self.said: list[str] = []
         self.failing: list[str] = []
         self.blocked: set[str] = set()
-        self._is_filming = self._end_asked = False
+        self.is_killed = self._is_filming = self._end_asked = False
         group = ReentrantCallbackGroup()
         options: dict[str, Any] = {"callback_group": group}
         self._actions = [
@@ -61,9 +62,15 @@ class FakeRobot(Node):
         return GoalResponse.REJECT if self._is_filming else GoalResponse.ACCEPT
 
     def _survey(self, handle: Any) -> Survey.Result:
-        self._is_filming, self._end_asked = True, False
+        is_killed = self.is_killed and not self.said
+        self._is_filming, self._end_asked = True, self.is_killed and not is_killed
         name = handle.request.survey_id
         self.said.append(f"survey {name}")
+        if is_killed:
+            self._is_filming = False
+            while rclpy.ok() and len(self.said) < 2:
+                time.sleep(WAIT)
+            return Survey.Result()
         while rclpy.ok() and not self._end_asked and not handle.is_cancel_requested:
             handle.publish_feedback(Survey.Feedback(state=Survey.Feedback.FILMING))
             time.sleep(WAIT)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeprog_bringup.results.atomic_output import OutputFolder, output_file
+from pipeprog_bringup.results.atomic_output import JOURNAL, OutputFolder, left_behind, output_file
 from pipeprog_camera.errors import InputError
 
 
@@ -179,3 +179,16 @@ def test_one_file_is_replaced_only_by_a_whole_one(tmp_path: Path) -> None:
     assert names(path.parent) == ["bag.mcap"]
     with pytest.raises(InputError, match="is a folder"), output_file(tmp_path):
         pass
+
+
+def test_what_a_killed_run_has_left_is_gone_on_with_and_its_journal_is_no_result(tmp_path: Path) -> None:
+    stage = tmp_path / "out" / ".pipeprog-left"
+    (stage / JOURNAL).mkdir(parents=True)
+    (stage / JOURNAL / "notes").write_text("here")
+    assert list(left_behind(tmp_path / "out")) == [stage]
+    with OutputFolder(tmp_path / "out", left=stage) as folder:
+        assert folder.file(f"{JOURNAL}/notes").read_text() == "here"
+        assert not list(left_behind(tmp_path / "out"))  # it is being written to
+        folder.file("run.json").write_text("{}")
+        assert folder.names() == ["run.json"]
+    assert [file.name for file in (tmp_path / "out").rglob("*")] == ["run.json"]

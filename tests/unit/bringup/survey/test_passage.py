@@ -17,6 +17,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 
+from pipeprog_bringup.playback.frame_log import LiveFrameLog
 from pipeprog_bringup.survey import passage as passages
 from pipeprog_bringup.survey.goal import Goal, read_site
 from pipeprog_bringup.survey.passage import CONFIGS, MAX_RESTARTS, Passage, SurveyFailure
@@ -91,7 +92,7 @@ class Stage:
             self._executor.add_node(node)
         self._waiting: list[Future] = []
         self._listener.create_timer(TICK, self._wake)
-        self.passage = Passage(self._listener, self._tick, lambda: False)
+        self.passage = Passage(self._listener, self._tick, lambda: False, LiveFrameLog())
 
     def run(self, coroutine: Any) -> Any:
         task = self._executor.create_task(coroutine)

@@ -46,6 +46,21 @@ def test_overlaps_that_are_no_shares_are_refused(changes: dict[str, Any], kind: 
     assert raised.value.kind == kind
 
 
+def test_the_readout_in_use_is_taken() -> None:
+    message = overlaps()
+    message.readout = 0.015
+    assert received_keyframes.image_overlaps(message).readout == 0.015
+
+
+@pytest.mark.parametrize("readout", [float("nan"), -0.01, 1.0])
+def test_a_readout_that_no_camera_has_is_refused(readout: float) -> None:
+    message = overlaps()
+    message.readout = readout
+    with pytest.raises(InvalidMessageError) as raised:
+        received_keyframes.image_overlaps(message)
+    assert raised.value.kind == "read-out"
+
+
 def test_more_answers_than_a_survey_has_keyframes_are_refused() -> None:
     message = overlaps()
     message.keyframes_considered = 2**32 - 1

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node `survey` writes down of a survey, so that one that is started in its place can go on with it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeprog_bringup.results.atomic_output import JOURNAL, left_behind
+from pipeprog_camera.errors import InputError
+from pipeprog_node.journal import Journal
+
+_NAME = "survey.journal"
+_ALIVE = 60.0  # s since the last sign of life, in which a supervisor starts a node anew; later the robot is elsewhere
+
+
+@dataclass
+class Progress:
+    """How far a survey has come.
+
+    Attributes:
+        goal: the action's goal, in CDR.
+        begun: how each of the other nodes has begun it; empty: not all have.
+        filming: when filming began, of the clock `time.monotonic`; 0: not yet.
+        is_filmed: whether filming has ended.
+    """
+
+    goal: bytes
+    begun: dict[str, dict[str, Any]] = field(default_factory=dict)
+    filming: float = 0.0
+    is_filmed: bool = False
+
+
+class SurveyJournal:
+    """The progress of a survey, and the decisions on its frames (`frames`)."""
+
+    def __init__(self, folder: Path, goal: bytes) -> None:
+        """`folder`: that of the nodes' journals; `goal` is of a survey that begins. Raises InputError."""
+        self._path = folder / _NAME
+        self.frames = Journal(self._path)
+        self.progress: Progress = self.frames.note or Progress(goal)
+        self.note()
+
+    def note(self) -> None:
+        """Writes the progress down."""
+        with contextlib.suppress(OSError):  # the disk is full: the survey ends by that
+            self.frames.write_note(self.progress)
+
+    def live(self) -> None:
+        """A sign of life, due every few seconds."""
+        with contextlib.suppress(OSError):
+            os.utime(self._path)
+
+    def forget_nodes(self) -> None:
+        """Removes what the other nodes have written: the survey begins once more."""
+        for file in self._path.parent.glob("*.journal"):
+            if file != self._path:
+                file.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Closes the file."""
+        self.frames.close()
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """A survey whose node was killed: its hidden folder and its goal, in CDR."""
+
+    folder: Path
+    goal: bytes
+
+
+def unfinished(results: Path) -> Unfinished | None:
+    """The survey in the folder `results` that was conducted a moment ago, and is not any more; None without one."""
+    for survey in results.iterdir() if results.is_dir() else ():
+        for folder in left_behind(survey):
+            file = folder / JOURNAL / _NAME
+            if not file.is_file() or abs(time.time() - file.stat().st_mtime) > _ALIVE:
+                continue
+            with contextlib.suppress(InputError):
+                journal = Journal(file)
+                journal.close()
+                if isinstance(journal.note, Progress):
+                    return Unfinished(folder, journal.note.goal)
+    return None

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The client of the action `survey` against a node that is killed."""
+
+from __future__ import annotations
+
+import pytest
+import rclpy
+
+from pipeprog_bringup.patrol import survey_client
+from pipeprog_bringup.patrol.round import Surveyed
+from pipeprog_bringup.patrol.survey_client import SurveyClient
+from tests.unit.bringup.patrol.fake_robot import fake_robot
+
+LOST = Surveyed(False, "the node survey is gone, and its survey with it", "")
+
+
+@pytest.mark.parametrize(("name", "found"), [("monday", Surveyed(True, "", "/surveys/monday")), ("", LOST)])
+def test_a_survey_with_a_name_is_asked_for_again_where_nothing_is_heard_of_it(
+    name: str, found: Surveyed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(survey_client, "SILENT_SECONDS", 1.0)
+    monkeypatch.setattr(survey_client, "GONE_SECONDS", 10.0 if name else 1.0)
+    with fake_robot() as robot:
+        robot.is_killed = True
+        client = SurveyClient(rclpy.create_node("mission"))
+        client.start(name)
+        assert client.result() == found
+        assert robot.said == [f"survey {name}"] * (2 if name else 1)
+        client.close()
