@@ -22,6 +22,7 @@ from pipeprog_bringup.footage.video import Video
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import focal_sigma_key, readout_key
 from pipeprog_bringup.recording.bag_writer import BagWriter
+from pipeprog_bringup.recording_check import MIN_FRAMES
 from pipeprog_bringup.results.atomic_output import output_file
 from pipeprog_camera.errors import InputError
 
@@ -69,6 +70,11 @@ def ingest(request: Request, report: Callable[[float, str], None]) -> Ingested:
         camera = calibration.camera if calibration else guessed_camera(request.source)
         if request.source.is_dir():
             footage = Pictures(request.source, camera)
+            if footage.expected < MIN_FRAMES:
+                raise InputError(
+                    f"{request.source} holds JPEG pictures, but {footage.expected} only, and a survey needs "
+                    f"{MIN_FRAMES} at the very least: is it the folder of the walk?"
+                )
         else:
             footage = Video(request.source, camera, request.camera or request.source)
     stamps: list[int] = []

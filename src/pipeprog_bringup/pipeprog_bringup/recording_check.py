@@ -7,6 +7,7 @@ A survey needs at least four images, some that are not black, and something that
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_bringup.fleet.memory import foreseen
+from pipeprog_bringup.frame_quality import REMEDIES, fault_of
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.frame_check import ImageMessage
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.raw_image import SAMPLES
-from pipeprog_frames.corners import sharpness
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.ellipses import detect_ellipses
@@ -33,7 +34,7 @@ SCALE_TOPICS = {"odometry", "/tf", "/tf_static"}  # of the graph; odometry, odom
 _SAMPLE = 12  # frames looked at: a board that a third of the frames show is missed once in 130 recordings
 _SECONDS = 3.0  # for reading at the start of a replay; what is not read by then counts for nothing
 _BLACK = 12.0  # mean of 0..255; a lens cap gives 0 to 5, a cellar lit by one lamp 20 and more
-_BLURRED = 0.25  # of the sharpest frame's sharpness: its edges are twice as wide
+_MANY = 1 / 3  # of the frames looked at: of three neighbours, which must agree, more than one is lost then
 _RESULT_SHARE = 14  # bytes of results for each byte of a recording of JPEG images (docs/fleet.md)
 
 
@@ -56,8 +57,7 @@ def check(bag: Bag, board_file: BoardFile, size: int) -> Findings:
     samples, stamps, unusable = _samples(bag, float("inf"))
     seconds = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
     seen = _boards_in(samples, bag.camera, board_file)
-    sharp = np.array([sharpness(one) for one in samples])
-    blurred = int((sharp < _BLURRED * sharp.max(initial=0.0)).sum())
+    poor = Counter(map(fault_of, samples))
     motion = sorted(bag.motion_topics.values())
     findings = Findings(
         {
@@ -71,8 +71,8 @@ def check(bag: Bag, board_file: BoardFile, size: int) -> Findings:
             "seconds": round(seconds, 2),
             "frames_per_second": round((len(stamps) - 1) / seconds, 2) if seconds > 0 else None,
             "frames_sampled": len(samples),
-            "black": len(_dark(samples)),
-            "blurred": blurred,
+            "black": sum(map(_is_dark, samples)),
+            **{kind: poor[kind] for kind in REMEDIES},
             "boards_seen": seen,
             "motion": motion,
             "result_mb": round(_RESULT_SHARE * size / 1e6),
@@ -87,10 +87,11 @@ def check(bag: Bag, board_file: BoardFile, size: int) -> Findings:
             findings.notes.append(f"{text}: is it the right file, and is the board in view, near, sharp and lit?")
         else:
             findings.faults.append(f"{text}, and nothing else tells the scale: film the board, or name its file")
-    if blurred > len(samples) / 3:
-        findings.notes.append(
-            f"{blurred} of {len(samples)} frames looked at are blurred: walk more slowly, or add light"
-        )
+    findings.notes += [
+        f"{poor[kind]} of {len(samples)} frames looked at are {remedy}"
+        for kind, remedy in REMEDIES.items()
+        if poor[kind] > _MANY * len(samples)
+    ]
     return findings
 
 
@@ -146,12 +147,12 @@ def gray_image(frame: ImageMessage, type_name: str) -> NDArray[np.uint8] | None:
     return rows.reshape(fields.height, fields.width, channels).mean(2).astype(np.uint8)
 
 
-def _dark(samples: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
-    return [one for one in samples if one.mean() < _BLACK]
+def _is_dark(gray: NDArray[np.uint8]) -> bool:
+    return bool(gray.mean() < _BLACK)
 
 
 def _black(samples: Sequence[NDArray[np.uint8]]) -> list[str]:
-    if not samples or len(_dark(samples)) < len(samples):
+    if not samples or not all(map(_is_dark, samples)):
         return []
     return [f"all {len(samples)} frames looked at are black: was the lens covered, or the light off?"]
 

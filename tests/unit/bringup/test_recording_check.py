@@ -92,3 +92,19 @@ def test_the_command_prints_json_and_ends_with_1_where_nothing_can_come_of_it(
         content = json.loads(capsys.readouterr().out)
         assert content["facts"]["frames"] == 8
         assert len(content["faults"]) == 1
+
+
+def test_a_film_that_is_blurred_or_dark_as_a_whole_is_told_with_its_remedy(
+    tmp_path: Path, board_file: BoardFile
+) -> None:
+    sharp = picture_of_the_board()
+    for pixels, kind, remedy in (
+        (cv2.GaussianBlur(sharp, (0, 0), 4.0), "blurred", "walk more slowly"),
+        ((20 + sharp * 0.1).astype(np.uint8), "flat", "add light"),
+        (np.clip(sharp * 7.0, 0, 255).astype(np.uint8), "overexposed", "expose for less"),
+    ):
+        found = recording_check.check(bag_of(tmp_path, pixels), board_file, 1)
+        assert found.facts[kind] == 4
+        (told,) = [note for note in found.notes if note.startswith("4 of 4 frames looked at are ")]
+        assert remedy in told
+    assert recording_check.check(bag_of(tmp_path, sharp), board_file, 1).notes == []

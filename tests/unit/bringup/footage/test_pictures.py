@@ -32,9 +32,10 @@ def test_pictures_come_as_they_were_taken_with_a_guess_of_their_camera(tmp_path:
     (walk / "IMG_2.JPG").write_bytes(photograph("2026:11:02 10:00:00", "5", 26))
     (walk / "IMG_10.JPG").write_bytes(photograph("2026:11:02 10:00:00", "25", 26))
     (walk / "IMG_3.JPG").write_bytes(photograph("2026:11:02 10:00:03", "", 26, turned=6))
+    (walk / "IMG_1.JPG").write_bytes(photograph("2026:11:02 10:00:04", "", 26))
     bag, notes = ingested(tmp_path)
     frames = list(bag)
-    assert np.diff([frame.stamp for frame in frames]).tolist() == [250_000_000, 2_500_000_000]
+    assert np.diff([frame.stamp for frame in frames]).tolist() == [250_000_000, 2_500_000_000, 1_000_000_000]
     assert bag.camera.fx == pytest.approx(26 / 43.27 * np.hypot(160, 96))
     assert bag.focal_sigma == 0.05
     assert not any(frame.fault for frame in frames)
@@ -43,11 +44,11 @@ def test_pictures_come_as_they_were_taken_with_a_guess_of_their_camera(tmp_path:
 
 
 def test_pictures_without_times_come_by_the_numbers_in_their_names(tmp_path: Path, walk: Path) -> None:
-    for name in ("b10.jpg", "b9.jpg", "b100.jpg"):
+    for name in ("b10.jpg", "b9.jpg", "b100.jpg", "b101.jpg"):
         (walk / name).write_bytes(photograph("", "", 26))
-    assert [file.name for file in picture_files(walk)] == ["b9.jpg", "b10.jpg", "b100.jpg"]
+    assert [file.name for file in picture_files(walk)] == ["b9.jpg", "b10.jpg", "b100.jpg", "b101.jpg"]
     bag, notes = ingested(tmp_path)
-    assert np.diff([frame.stamp for frame in bag]).tolist() == [1_000_000_000] * 2
+    assert np.diff([frame.stamp for frame in bag]).tolist() == [1_000_000_000] * 3
     assert any("one a second" in note for note in notes)
 
 
@@ -67,6 +68,14 @@ def test_what_cannot_be_used_is_named(tmp_path: Path, walk: Path) -> None:
     (walk / "0.jpg").write_bytes(photograph())
     with pytest.raises(InputError, match="does not tell its focal length"):
         ingested(tmp_path)
+
+
+def test_a_stray_picture_is_no_walk(tmp_path: Path, walk: Path) -> None:
+    for number in range(3):
+        (walk / f"{number}.jpg").write_bytes(photograph("2026:11:02 10:00:00", "", 26))
+    with pytest.raises(InputError, match=r"3 only, and a survey needs 4 .* is it the folder of the walk\?"):
+        ingested(tmp_path)
+    assert not (tmp_path / "walk.mcap").exists()
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8", photograph("yesterday", "x", 3), photograph("2026:13:41 10:00:00")])
