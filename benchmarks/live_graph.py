@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -37,23 +38,29 @@ COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # what is measured is the
 RESPAWN_DELAY = 2.0  # s, as the launch file has it
 PERIOD = 0.1  # s between two images
 DEFERRED = 1.0  # s for the decision on an image: the selector takes 10 ms
+ATTEMPTS = 20  # to send a goal: a node that is started anew is active a moment later
+ANSWER = 5.0  # s for the answer to a goal: none comes from a node that is not there
 PATIENCE = 600.0  # s for what takes a minute on an idle machine
 
 
 class LiveGraph:
     """Context in which the four nodes run, each a process that is started again after its death."""
 
-    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
-        """`folder` takes parameter files, logs and, under `surveys`, the results; `settings`: of sfm."""
+    def __init__(self, folder: Path, settings: dict[str, Any], intermediate: bool = True) -> None:
+        """`folder` takes parameter files, logs and, under `surveys`, the results; `settings`: of sfm.
+
+        Without `intermediate` there is the last map alone, as in a replay.
+        """
         self._folder = folder
         self._parameters: dict[str, dict[str, Any]] = {
             "frames": {"idle": True},
-            "sfm": {"map_interval": 4, **settings},
-            "detect": {"boq": str(BOQ)},
+            "sfm": {"map_interval": 4, "intermediate": intermediate, **settings},
+            "detect": {"boq": str(BOQ), "intermediate": intermediate},
             "survey": {"boq": str(BOQ), "board": str(BOARD), "results": str(folder / "surveys")},
         }
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._dead_since: dict[str, float] = {}
+        self.starts: Counter[str] = Counter()  # of each process
 
     def __enter__(self) -> LiveGraph:
         for name in MODULES:
@@ -88,6 +95,7 @@ class LiveGraph:
         return {name: _unique_mb(process.pid) for name, process in self._processes.items()}
 
     def _start(self, name: str) -> None:
+        self.starts[name] += 1
         file = self._folder / f"{name}.yaml"
         file.write_text(yaml.safe_dump({name: {"ros__parameters": self._parameters[name]}}))
         command = [sys.executable, "-m", MODULES[name], "--ros-args", "-r", f"__node:={name}"]
@@ -152,18 +160,38 @@ class Robot:
         self._place, self._shown, self._decided = -1, 0, 0
         self._chosen = self._answered = 0
         self._is_over = False
-        self.wait_for(self._client.server_is_ready)
-        sent = self._client.send_goal_async(
-            Survey.Goal(survey_id=name), lambda heard: self.feedback.append(heard.feedback)
-        )
-        self.wait_for(sent.done)
-        assert sent.result().accepted
-        over = sent.result().get_result_async()
-        self.wait_for(lambda: over.done() or (self._is_filming() and self.is_at_the_end), each)
+        over = self._asked_for(name)
+        over = self._heard_of(over, name, lambda: self._is_filming() and self.is_at_the_end, each)
         if not over.done():
             self._called(self._end, Trigger.Request())
-        self.wait_for(over.done, each)
-        return over.result()
+        return self._heard_of(over, name, lambda: False, each).result()
+
+    def _heard_of(self, over: Any, name: str, condition: Callable[[], bool], each: Callable[[], None]) -> Any:
+        """Waits for a condition or the end; returns the future of the answer, asked for again from a node anew."""
+        while True:
+            lives = self._graph.starts["survey"]
+            self.wait_for(
+                lambda over=over, lives=lives: (  # type: ignore[misc]
+                    over.done() or condition() or self._graph.starts["survey"] > lives
+                ),
+                each,
+            )
+            if self._graph.starts["survey"] == lives:
+                return over
+            over = self._asked_for(name)
+
+    def _asked_for(self, name: str) -> Any:
+        """The future of a goal's answer, sent until it is accepted."""
+        for _ in range(ATTEMPTS):
+            self.wait_for(self._client.server_is_ready)
+            sent = self._client.send_goal_async(
+                Survey.Goal(survey_id=name), lambda heard: self.feedback.append(heard.feedback)
+            )
+            waited = time.monotonic() + ANSWER
+            self.wait_for(lambda sent=sent, waited=waited: sent.done() or time.monotonic() > waited)  # type: ignore[misc]
+            if sent.done() and sent.result().accepted:
+                return sent.result().get_result_async()
+        raise RuntimeError(f"the goal {name} was refused {ATTEMPTS} times")
 
     def wait_for(self, condition: Callable[[], object], each: Callable[[], None] = lambda: None) -> None:
         """Lets time pass until a condition holds; raises TimeoutError after PATIENCE."""
