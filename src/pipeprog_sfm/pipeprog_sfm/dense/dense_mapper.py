@@ -75,9 +75,9 @@ class DenseMapper:
 
     def __init__(self, stereo: StereoConfig, fusion: FusionConfig) -> None:
         self._stereo_config, self._fusion_config = stereo, fusion
-        # On a straight walk a point is visible in 1 / (1 - overlap) depth maps. That is four times the number that
-        # must agree on it: in the others it may be occluded, oblique, blurred, or too thin to be matched.
-        self._overlap = 1.0 - 1.0 / (4 * fusion.min_views)
+        # On a straight walk a point is visible in 1 / (1 - overlap) depth maps. That is twice the number that must
+        # agree on it: in the others it may be occluded, oblique, blurred, or too thin to be matched.
+        self._overlap = 1.0 - 1.0 / (2 * fusion.min_views)
         self._picture = lru_cache(maxsize=PICTURES)(_picture)
         self._depths: dict[int, Future[_Depth]] = {}
         self._waiting: deque[Callable[[], None]] = deque()
