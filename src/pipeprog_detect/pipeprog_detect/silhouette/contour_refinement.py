@@ -28,8 +28,9 @@ AXIS_RANGE, RADIUS_RANGE = (3.0, 2.0, 0.4), (2.5, 2.0, 0.3)
 RADIUS_FIXED = 1e-5
 # The distance from the cameras is sought within two of its standard deviations.
 DEPTH_RANGE = 2.0
-# Up to three results of the search compete on sub-pixel edges, if their contours differ by this much [px rms].
-APART, CANDIDATES = 0.8, 3
+# The start and up to three results of the search compete on sub-pixel edges, if their contours differ by this much
+# [px rms].
+APART, CANDIDATES = 0.8, 4
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,8 @@ def _first_steps(start: Start, scene: Scene, planned_radii: Sequence[float]) -> 
         seeds = np.zeros((len(near), 5))
         seeds[:, 4] = near
         profiles = scene.wide_profiles(samples, furthest)
-        steps = best_steps(samples, profiles, reach, seeds)
+        # The start itself is nearer than what the search prefers where another edge lies beside the contour.
+        steps = np.vstack([np.zeros(5), best_steps(samples, profiles, reach, seeds)])
         return distinct(steps, samples, APART, CANDIDATES), start.precision()
     side = None if start.seen is None else only_visible_side(scene)
     if start.seen is None or side is None:
