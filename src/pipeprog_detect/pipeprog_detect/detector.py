@@ -22,6 +22,7 @@ from pipeprog_detect.product import classification
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import viewing_direction
+from pipeprog_detect.thin.false_lines import is_false_line
 from pipeprog_detect.thin.thin_pipes import find_thin_pipes
 from pipeprog_detect.types import Cloud, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
@@ -148,7 +149,7 @@ def detect_outside(
     # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
     criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
     measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
-    measured = _genuine(measured, around, judging)
+    measured = _without_false_lines(_genuine(measured, around, judging), prepared.points, judging)
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(prepared.points, THICKEST_LINE, measured, judging, boq, edges)
@@ -197,6 +198,20 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
     ]
     own = own_contours([each.cylinder for each in clear], views)
     return [each for each, is_own in zip(clear, own, strict=True) if is_own]
+
+
+def _without_false_lines(measured: list[MeasuredPipe], points: FloatArray, views: Sequence[View]) -> list[MeasuredPipe]:
+    """Those that are no false lines, as thin ones may be, whose section the points (N, 3) do not show."""
+    if not views:
+        return measured
+    single = points.astype(np.float32)
+    cylinders = [each.cylinder for each in measured]
+
+    def is_genuine(number: int) -> bool:
+        each, others = cylinders[number], cylinders[:number] + cylinders[number + 1 :]
+        return each.radius >= THICKEST_LINE or not is_false_line(each, single, views, others)
+
+    return [each for number, each in enumerate(measured) if is_genuine(number)]
 
 
 def _abutted(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:

@@ -18,6 +18,9 @@ BESIDE_REACH = 4.0
 # Strip of cloud beside a thin pipe in which a face that it is the edge of must go on: beyond what half a stereo window
 # spreads of the pipe itself, in radii.
 FACE = (4.0, 8.0)
+# Share of its length along which the cloud must show what is there and beside it, to tell whether a line is an edge:
+# more than clamps and crossing pipes take.
+SHOWN = 0.2
 # Distance before and behind a proposed axis in which the cloud counts [m].
 DEPTH_REACH = 0.3
 # Along the lines of sight to a thin pipe the cloud shows more of the wall than of it: this percentile of the depths is
@@ -94,12 +97,16 @@ def at_cloud_depth(
     return Cylinder(ends[0], ends[1], cylinder.radius)
 
 
-def is_edge_of_face(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) -> bool:
+def is_edge_of_face(cylinder: Cylinder, points: NDArray[np.float32], views: Sequence[View]) -> bool:
     """Whether a face whose edge it is goes on beside it: a tray's, a duct's or a board's.
 
-    Seen from `centre`, the cloud's points (N, 3) then lie as far away beside it, on one side, as on it, and on the
-    other side farther away by its diameter at least.
+    Seen from the mean centre of the views, the cloud's points (N, 3) then lie as far away beside it, on one side, as
+    where it is, and on the other side farther away by its diameter at least. What the cloud shows there may be nearer
+    than it, since lines tell the depth of an edge badly, but not behind it.
     """
+    centre = mean_centre(cylinder, views)
+    if centre is None:
+        return False
     depth, radius = float((cylinder.start - centre) @ _sight(cylinder, centre)[1]), cylinder.radius
     bins, cell, aside, far = _beside(cylinder, points, centre)
 
@@ -108,13 +115,16 @@ def is_edge_of_face(cylinder: Cylinder, points: NDArray[np.float32], centre: Flo
         return by_bin(cell[there], far[there], bins, 50.0)
 
     on, beside = level(-0.6, 0.6), (level(-FACE[1], -FACE[0]), level(*FACE))
-    shown = np.abs(on - depth) < 2.0 * radius
+    shown = on - depth < 2.0 * radius
     flush, open_beside = (
-        [np.abs(each - on) < radius for each in beside],
+        [np.abs(each - on) < 2.0 * radius for each in beside],
         [~(each - on < 2.0 * radius) for each in beside],
     )
-    edge = [shown & one & other for one, other in zip(flush, reversed(open_beside), strict=True)]
-    return bool(max(each.sum() for each in edge) > 0.5 * bins)
+    for face, flush_there, open_there in zip(beside, flush, reversed(open_beside), strict=True):
+        told = shown & np.isfinite(face)
+        if told.sum() > SHOWN * bins and (told & flush_there & open_there).sum() > 0.5 * told.sum():
+            return True
+    return False
 
 
 def _beside(

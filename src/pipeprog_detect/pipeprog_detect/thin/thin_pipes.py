@@ -16,7 +16,8 @@ from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
-from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, is_edge_of_face, mean_centre
+from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
+from pipeprog_detect.thin.false_lines import is_false_line
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.thin.pair_views import pair_views
 from pipeprog_detect.thin.parallel_axes import (
@@ -83,8 +84,7 @@ def find_thin_pipes(
     def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
             return
-        centre = mean_centre(fit.cylinder, views)
-        if centre is not None and is_edge_of_face(fit.cylinder, some, centre):
+        if is_false_line(fit.cylinder, some, views, known):
             return
         thin.append(MeasuredPipe(_as_candidate(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
         known.append(fit.cylinder)

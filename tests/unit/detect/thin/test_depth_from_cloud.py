@@ -44,12 +44,23 @@ def test_the_wall_beside_and_behind_a_pipe_does_not_lay_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("above", "below", "edge"),
-    [(0.3, 0.0, True), (None, 0.0, True), (0.0, 0.0, False), (0.3, 0.3, False), (0.012, 0.0, False)],
+    ("above", "below", "behind", "edge"),
+    [
+        (0.3, 0.0, 0.0, True),
+        (None, 0.0, 0.0, True),
+        (0.0, 0.0, 0.0, False),
+        (0.3, 0.3, 0.0, False),
+        (0.012, 0.0, 0.0, False),
+        (0.3, 0.012, 0.0, True),  # a face that is seen aslant
+        (0.3, 0.0, 0.03, True),  # the line is laid behind the face, where no pipe can be seen
+        (0.3, 0.0, -0.03, False),  # before it
+    ],
 )
-def test_a_line_with_a_face_on_one_side_is_that_faces_edge(above: float | None, below: float, edge: bool) -> None:
+def test_a_line_with_a_face_on_one_side_is_that_faces_edge(
+    above: float | None, below: float, behind: float, edge: bool, pipe_views: list[View]
+) -> None:
     """A face goes on at its depth on one side; on the other one the next surface lies a diameter deeper, or nothing."""
-    line = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    line = Cylinder(np.array([-0.3, behind, 0.0]), np.array([0.3, behind, 0.0]), 0.0086)
     rng = np.random.default_rng(3)
     height = np.concatenate([rng.uniform(-0.07, 0.009, 9000), rng.uniform(0.009, 0.07, 9000)])
     deeper = np.where(height > 0.009, np.nan if above is None else above, np.where(height < -0.009, below, 0.0))
@@ -57,7 +68,7 @@ def test_a_line_with_a_face_on_one_side_is_that_faces_edge(above: float | None, 
         [rng.uniform(-0.35, 0.35, len(height)), deeper + rng.normal(0.0, 2e-3, len(height)), height], axis=1
     )
     points = points[np.isfinite(points).all(axis=1)].astype(np.float32)
-    assert is_edge_of_face(line, points, np.array([0.0, -1.5, 0.0])) == edge
+    assert is_edge_of_face(line, points, pipe_views) == edge
 
 
 def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:
