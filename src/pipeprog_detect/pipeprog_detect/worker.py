@@ -135,7 +135,10 @@ def serve(
         if any(asks_look(pipe, boq, config.concave) for pipe in pipes):
             seen = Seen(views, keyframes.colour, command.points.astype(float), command.circles)
             pipes = told_by_look(pipes, boq, seen, config.concave)
-        connection.send(PipesReady(command.revision, product_of(identities.named(pipes), boq)))
+        # In the end the names are those of `detect`, by place: earlier ones depend on which maps came in between.
+        if not command.final:
+            pipes = identities.named(pipes)
+        connection.send(PipesReady(command.revision, product_of(pipes, boq)))
 
 
 def _views(connection: Connection, command: Map, keyframes: Keyframes) -> Iterator[View]:

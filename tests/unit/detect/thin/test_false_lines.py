@@ -17,8 +17,9 @@ SHADOW = 0.055  # x [m] of its edge on the wall
 @pytest.mark.parametrize("radius", [0.0086, 0.0125, 0.02])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_the_edge_of_a_shadow_is_one_step(radius: float, side: float, empty_views: list[View]) -> None:
-    axis = np.array([SHADOW + side * radius, WALL, 0.0])
-    line = Cylinder(axis - [0.0, 0.0, 0.2], axis + [0.0, 0.0, 0.2], radius)
+    place = np.array([SHADOW + side * radius, WALL, 0.0])
+    half = np.array([0.0, 0.0, 0.2])
+    line = Cylinder(place - half, place + half, radius)
     assert is_one_step(Scene.of(line, empty_views, []))
     assert is_false_line(line, wall_points().astype(np.float32), empty_views, [])
 
