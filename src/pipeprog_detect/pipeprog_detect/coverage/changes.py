@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -94,7 +95,7 @@ def _shared(old: KnownPipe, new: KnownPipe) -> float:
 
 def _known(old: KnownPipe, pieces: Sequence[KnownPipe], own: AxisCoverage) -> Change:
     """The change of a pipe that was there before, of which `own` is what the survey after tells of its axis."""
-    length, now = old.cylinder.length, sum(piece.cylinder.length for piece in pieces)
+    length, now = old.cylinder.length, math.fsum(piece.cylinder.length for piece in pieces)
     ids = tuple(piece.id for piece in pieces)
     if not pieces:
         gone = own.metres(Sight.EMPTY) > 0.5 * length
