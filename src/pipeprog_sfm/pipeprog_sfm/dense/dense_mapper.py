@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
@@ -37,6 +38,11 @@ NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector w
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
 SAMPLE = 200  # points of a keyframe from which its overlap with others is estimated, to 0.04
 SAME_SIDE = np.radians(8.0)  # between rays to a point; beyond (baseline 0.14 of the depth) a view adds information
+# A keyframe of which the newest one sees less than this share is left behind: no nearer one comes any more.
+LEFT_BEHIND = 0.5
+# Share of a keyframe's points that too few depth maps show, from which on it gets its own: that is what the margins of
+# a swaying image show. The sample of its points tells it with a standard deviation of 0.014.
+MARGIN = 0.04
 NO_MOTIONS: Mapping[int, RowMotion] = {}  # of a global shutter
 STILL = RowMotion(0.0, 1, np.zeros(3), np.zeros(3))  # all rows at the stamp, however many there are
 SAME_SCALE = 1.5  # ratio of depths; a view that is nearer by more shows more detail
@@ -68,8 +74,8 @@ class _Depth:
 class DenseMapper:
     """Depth maps and their fusion, in one thread of low priority beside the mapper.
 
-    A keyframe gets a depth map unless another one shows nearly the same: what is held grows with the map, not with the
-    time spent in it. Depth maps are made in the order of the calls with the poses of the call, so that the result does
+    A keyframe gets a depth map unless another one shows nearly the same, and in the end enough of them what it shows at
+    its margins: what is held grows with the map, not with the time spent in it. Depth maps are made in the order of the calls with the poses of the call, so that the result does
     not depend on timing.
     """
 
@@ -83,6 +89,7 @@ class DenseMapper:
         self._waiting: deque[Callable[[], None]] = deque()
         self._submitted: deque[Future[None]] = deque()
         self._covered: dict[int, int] = {}  # keyframes without a depth map, and the one that shows the same
+        self._unsettled: deque[int] = deque()  # of these, those whose surroundings have not all got theirs
         self._refused: dict[int, int] = {}  # keyframes without neighbours to match, and the size of the map then
         self._thread = ThreadPoolExecutor(max_workers=1, initializer=_be_nice)
         self._fusion = Fusion(fusion)  # from here on the thread's own
@@ -112,7 +119,8 @@ class DenseMapper:
         for stamp in stamps if complete else stamps[:-LOOKAHEAD]:
             grown = len(poses) > 1.1 * self._refused.get(stamp, 0) + 2
             if stamp not in self._depths and stamp not in self._covered and (grown or complete):
-                self._consider(stamp, poses, images, points(stamp), motions)
+                self._consider(stamp, poses, images, _in_front(poses[stamp], points(stamp)), motions)
+        self._settle(poses, images, points, complete, motions)
         self._submit(all_of_them=complete)
 
     def retire(self, stamps: Collection[int]) -> None:
@@ -126,7 +134,7 @@ class DenseMapper:
 
     def clear(self) -> None:
         """Gives up all depth maps and the cloud: the images have another calibration now."""
-        for known in (self._depths, self._covered, self._refused, self._waiting):
+        for known in (self._depths, self._covered, self._unsettled, self._refused, self._waiting):
             known.clear()
         self._thread.submit(self._start_anew)
 
@@ -159,18 +167,52 @@ class DenseMapper:
         points: FloatArray,
         motions: Mapping[int, RowMotion],
     ) -> None:
-        pose = poses[stamp]
-        depth = points @ pose[2, :3] + pose[2, 3]
-        points, depth = points[depth > 0], depth[depth > 0]
-        if len(depth) < MIN_POINTS:
+        if len(points) < MIN_POINTS:
             self._refused[stamp] = len(poses)
             return
-        sample = points[:: max(len(points) // SAMPLE, 1)]
         mapped = [other for other in self._depths if other in poses]
-        seen = overlap(sample, pose, [(poses[other], images[other].camera) for other in mapped])
+        seen = overlap(_sample(points), poses[stamp], [(poses[other], images[other].camera) for other in mapped])
         if len(seen) and seen.max() > self._overlap:
             self._covered[stamp] = mapped[int(seen.argmax())]
+            self._unsettled.append(stamp)
             return
+        self._start(stamp, poses, images, points, motions)
+
+    def _settle(
+        self,
+        poses: Mapping[int, FloatArray],
+        images: Mapping[int, EncodedImage],
+        points: Callable[[int], FloatArray],
+        complete: bool,
+        motions: Mapping[int, RowMotion],
+    ) -> None:
+        """Starts depth maps of covered keyframes that show, at a margin, what too few others show.
+
+        That is known once the walk has left behind what they show, or is complete.
+        """
+        while self._unsettled:
+            stamp = self._unsettled[0]
+            if stamp in self._covered and stamp in poses:
+                sample = _sample(_in_front(poses[stamp], points(stamp)))
+                newest = max(poses)
+                if not complete and in_image(sample, [(poses[newest], images[newest].camera)]).mean() > LEFT_BEHIND:
+                    return
+                mapped = [(poses[other], images[other].camera) for other in self._depths if other in poses]
+                missed = in_image(sample, mapped).sum(axis=0) < self._fusion_config.min_views
+                if missed.sum() > MARGIN * len(sample):
+                    del self._covered[stamp]
+                    self._start(stamp, poses, images, _in_front(poses[stamp], points(stamp)), motions)
+            self._unsettled.popleft()
+
+    def _start(
+        self,
+        stamp: int,
+        poses: Mapping[int, FloatArray],
+        images: Mapping[int, EncodedImage],
+        points: FloatArray,
+        motions: Mapping[int, RowMotion],
+    ) -> None:
+        depth = points @ poses[stamp][2, :3] + poses[stamp][2, 3]
         near, middle, far = np.percentile(depth, [1, 50, 99])
         # The sweep compares images of one size; a camera that switches its resolution has neighbours on either side.
         width = self._stereo_config.width
@@ -249,19 +291,28 @@ def overlap(
     if not others:
         return np.zeros(0)
     poses = np.stack([camera_from_model, *(pose for pose, _ in others)])
-    inside = np.einsum("vij,kj->vki", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-    depth = inside[..., 2]
-    cameras = [(each.fx, each.fy, each.cx, each.cy, each.width, each.height) for _, each in others]
-    fx, fy, cx, cy, width, height = np.array(cameras, float).T[..., None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = inside[1:, :, 0] / depth[1:] * fx + cx
-        v = inside[1:, :, 1] / depth[1:] * fy + cy
+    depth = points @ poses[:, 2, :3].T + poses[:, 2, 3]
     rays = points - -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])[:, None]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    seen = (depth[1:] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    seen = in_image(points, others)
     seen &= (np.einsum("vki,ki->vk", rays, rays[0]) > np.cos(SAME_SIDE))[1:]
-    seen &= depth[1:] < SAME_SCALE * depth[0]
-    return seen.mean(axis=1)
+    seen &= depth.T[1:] < SAME_SCALE * depth.T[0]
+    return np.asarray(seen.mean(axis=1), np.float64)
+
+
+def in_image(points: FloatArray, views: Sequence[tuple[FloatArray, Camera]]) -> NDArray[np.bool_]:
+    """(V, K) whether views, each a (4, 4) camera_from_model and a calibration, show the (K, 3) points."""
+    if not views:
+        return np.zeros((0, len(points)), bool)
+    poses = np.stack([pose for pose, _ in views])
+    inside = np.einsum("vij,kj->vki", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    cameras = [(each.fx, each.fy, each.cx, each.cy, each.width, each.height) for _, each in views]
+    fx, fy, cx, cy, width, height = np.array(cameras, float).T[..., None]
+    depth = inside[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = inside[..., 0] / depth * fx + cx
+        v = inside[..., 1] / depth * fy + cy
+    return np.asarray((depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
 
 
 def distance(camera_from_world: FloatArray, other_from_world: FloatArray) -> float:
@@ -272,6 +323,16 @@ def distance(camera_from_world: FloatArray, other_from_world: FloatArray) -> flo
 def centre(camera_from_world: FloatArray) -> FloatArray:
     """(3,) projection centre of a (4, 4) pose."""
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+
+
+def _in_front(camera_from_model: FloatArray, points: FloatArray) -> FloatArray:
+    """Of (K, 3) points those before the camera."""
+    return points[points @ camera_from_model[2, :3] + camera_from_model[2, 3] > 0]
+
+
+def _sample(points: FloatArray) -> FloatArray:
+    """Some of (K, 3) points, from all over the image."""
+    return points[:: max(len(points) // SAMPLE, 1)]
 
 
 def _picture(image: EncodedImage, width: int) -> Picture:
