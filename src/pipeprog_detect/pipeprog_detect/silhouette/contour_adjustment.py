@@ -92,7 +92,11 @@ def adjusted(scene: Scene, prior: FloatArray, so_far: FloatArray) -> AdjustedCyl
 
 
 def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
-    """Of candidate steps (K, 5) the most probable one after a pass on sub-pixel edges; so improved."""
+    """Of candidate steps (K, 5) the most probable one after a pass on sub-pixel edges; so improved.
+
+    Two edges side by side are both seen all along the pipe; which one is its contour is told by where the pipe starts
+    from, too, with the precision `prior` (5, 5).
+    """
     trials = []
     for step in steps:
         found = _pass(scene, step, prior, step, COARSE_REACH, COARSE_SAMPLES)
@@ -100,7 +104,8 @@ def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
             trials.append((step, -np.inf))
         else:
             samples, edges, solution = found
-            trials.append((step + solution.step, _log_odds(samples, edges, solution)))
+            total = step + solution.step
+            trials.append((total, _log_odds(samples, edges, solution) - 0.5 * float(total @ prior @ total)))
     return max(trials, key=lambda trial: trial[1])[0]
 
 

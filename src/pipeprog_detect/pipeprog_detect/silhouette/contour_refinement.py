@@ -28,9 +28,9 @@ AXIS_RANGE, RADIUS_RANGE = (3.0, 2.0, 0.4), (2.5, 2.0, 0.3)
 RADIUS_FIXED = 1e-5
 # The distance from the cameras is sought within two of its standard deviations.
 DEPTH_RANGE = 2.0
-# The start and up to three results of the search compete on sub-pixel edges, if their contours differ by this much
-# [px rms].
-APART, CANDIDATES = 0.8, 4
+# Up to three results of the search, if their contours differ by this much [px rms], compete on sub-pixel edges with the
+# start.
+APART, CANDIDATES = 0.8, 3
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,9 @@ def _first_steps(start: Start, scene: Scene, planned_radii: Sequence[float]) -> 
         seeds = np.zeros((len(near), 5))
         seeds[:, 4] = near
         profiles = scene.wide_profiles(samples, furthest)
+        steps = distinct(best_steps(samples, profiles, reach, seeds), samples, APART, CANDIDATES)
         # The start itself is nearer than what the search prefers where another edge lies beside the contour.
-        steps = np.vstack([np.zeros(5), best_steps(samples, profiles, reach, seeds)])
-        return distinct(steps, samples, APART, CANDIDATES), start.precision()
+        return np.vstack([steps, np.zeros(5)]), start.precision()
     side = None if start.seen is None else only_visible_side(scene)
     if start.seen is None or side is None:
         return None
