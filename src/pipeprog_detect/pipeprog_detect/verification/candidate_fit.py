@@ -69,9 +69,9 @@ class CandidateFitter:
         return best
 
     def near_planned(
-        self, fit: ContourFit | None, others: Sequence[Cylinder], views: Sequence[View]
+        self, candidate: Candidate, fit: ContourFit | None, others: Sequence[Cylinder], views: Sequence[View]
     ) -> ContourFit | None:
-        """The fit, or one of a planned radius near it whose contour is about as well supported.
+        """The fit of a candidate, or one of a planned radius near it whose contour is about as well supported.
 
         A shadow along a pipe is taken for its contour where the cameras never rise or fall. Pipes of sizes that nobody
         planned are rarer than shadows, but where the planned size finds no contour of its own the fit stands.
@@ -82,6 +82,7 @@ class CandidateFitter:
         for planned in self._radii():
             if abs(planned / radius - 1.0) < NEAR_PLANNED:
                 again = _at_radius(fit.cylinder, planned, abs(planned - radius), views, others)
+                again = again or _of_one_side(replace(candidate, cylinder=fit.cylinder), planned, views, others)
                 if again is not None and self.is_planned(again) and again.support > AS_GOOD * fit.support:
                     return again
         return fit
@@ -119,10 +120,7 @@ class CandidateFitter:
         near = self._within_reach(candidate)
         if len(near) != 1:
             return None
-        sigma = _sigma(candidate)
-        seen = SeenArc(candidate.evidence.arc, sigma)
-        planned = replace(candidate.cylinder, radius=near[0])
-        return refine(Start(planned, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
+        return _of_one_side(candidate, near[0], views, others)
 
     def strays(self, candidate: Candidate, fit: ContourFit) -> bool:
         """Whether the fit has a radius out of reach of the candidate's: it follows the edges of other things."""
@@ -167,6 +165,16 @@ def _at_radius(
     """The fit of a cylinder with another radius, which is taken as known."""
     start = Start(replace(cylinder, radius=radius), radius_sigma, radius_known=True, ends_known=True)
     return refine(start, views, others)
+
+
+def _of_one_side(
+    candidate: Candidate, radius: float, views: Sequence[View], others: Sequence[Cylinder]
+) -> ContourFit | None:
+    """The fit of a candidate of which one side is seen, with a radius that this side cannot tell; None without one."""
+    sigma = _sigma(candidate)
+    seen = SeenArc(candidate.evidence.arc, sigma)
+    known = replace(candidate.cylinder, radius=radius)
+    return refine(Start(known, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
 
 
 def _sigma(candidate: Candidate) -> float:

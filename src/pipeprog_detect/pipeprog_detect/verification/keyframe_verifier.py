@@ -54,7 +54,7 @@ class KeyframeVerifier:
             return False
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
         fit = self._fitter.fit(candidate, [], views, follow=False)
-        fit = self._fitter.near_planned(fit, [], self._views)
+        fit = self._fitter.near_planned(candidate, fit, [], self._views)
         if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
             self._refused.append(cylinder)
             return False
@@ -121,7 +121,7 @@ class KeyframeVerifier:
             if fit is None or (candidate.blurred and not self._stands_alone(fit.cylinder, others)):
                 return None
         else:
-            fit = self._fitter.near_planned(fit, others, self._views)
+            fit = self._fitter.near_planned(candidate, fit, others, self._views)
         if fit is None:
             return MeasuredPipe.of_cloud(candidate)
         if not self._fitter.is_planned(fit) and contradict(candidate, fit):
