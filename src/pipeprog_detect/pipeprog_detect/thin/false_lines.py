@@ -18,6 +18,10 @@ from pipeprog_detect.verification.candidate_fit import CONVINCING
 # of the step. A pipe differs from what is behind it on both sides; two surfaces of which one is as bright as the pipe
 # would have to agree with it to this share.
 ONE_STEP = 1.0 / 8.0
+# Towards the edge between two faces light falls off over some millimetres (ambient occlusion), which adds to the change
+# beside the step if it goes on in the direction of the step: twice the share then. A pipe mostly differs from what lies
+# on both sides in the same direction.
+ONE_STAIR = 2.0 * ONE_STEP
 
 
 def is_false_line(
@@ -36,5 +40,6 @@ def is_one_step(scene: Scene) -> bool:
     count = np.bincount(samples.side, minlength=2)
     if not count.all():
         return False
-    weaker, stronger = sorted(np.abs(np.bincount(samples.side, light[:, 0] - light[:, 1], 2) / count))
-    return bool(weaker < ONE_STEP * stronger)
+    outwards = np.bincount(samples.side, light[:, 0] - light[:, 1], 2) / count
+    weaker, stronger = sorted(np.abs(outwards))
+    return bool(weaker < (ONE_STAIR if outwards.prod() < 0.0 else ONE_STEP) * stronger)
