@@ -75,8 +75,8 @@ class DenseMapper:
     """Depth maps and their fusion, in one thread of low priority beside the mapper.
 
     A keyframe gets a depth map unless another one shows nearly the same, and in the end enough of them what it shows at
-    its margins: what is held grows with the map, not with the time spent in it. Depth maps are made in the order of the calls with the poses of the call, so that the result does
-    not depend on timing.
+    its margins: what is held grows with the map, not with the time spent in it. Depth maps are made in the order of the
+    calls with the poses of the call, so that the result does not depend on timing.
     """
 
     def __init__(self, stereo: StereoConfig, fusion: FusionConfig) -> None:
