@@ -27,6 +27,9 @@ NEAR_PLANNED, AS_GOOD = 0.15, 0.6
 # Planned radii are within reach of a candidate up to this many standard deviations, and of a fit, which adds the
 # tolerance of manufacture (1 %, EN 10255).
 REACH, MANUFACTURE = 3.0, 0.01
+# A radius with a larger standard deviation than this share of it is not told by what is seen, since sizes of pipes are
+# a tenth apart at the least (DN200 and DN225).
+TOLD = 0.03
 
 
 @dataclass(frozen=True)
@@ -74,12 +77,13 @@ class CandidateFitter:
         """The fit of a candidate, or one of a planned radius near it whose contour is about as well supported.
 
         A shadow along a pipe is taken for its contour where the cameras never rise or fall. Pipes of sizes that nobody
-        planned are rarer than shadows, but where the planned size finds no contour of its own the fit stands.
+        planned are rarer than shadows, but where the planned size finds no contour of its own the fit stands. The one
+        side that is seen of a pipe does not tell its radius either.
         """
-        if fit is None or self.is_planned(fit):
+        if fit is None or (self.is_planned(fit) and fit.radius_sigma < TOLD * fit.cylinder.radius):
             return fit
         radius = fit.cylinder.radius
-        for planned in self._radii():
+        for planned in sorted(self._radii(), key=lambda each: abs(each - radius)):
             if abs(planned / radius - 1.0) < NEAR_PLANNED:
                 again = _at_radius(fit.cylinder, planned, abs(planned - radius), views, others)
                 again = again or _of_one_side(replace(candidate, cylinder=fit.cylinder), planned, views, others)

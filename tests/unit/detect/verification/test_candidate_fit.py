@@ -21,6 +21,8 @@ from tests.unit.detect.straight_ahead import looking_along_y
 
 PLANNED, SIGMA = 0.0086, 0.00015
 PIPE = Cylinder(np.zeros(3), np.array([1.0, 0.0, 0.0]), 0.0105)
+# Hides one side of the pipe of `pipe_views` in all of them.
+BEFORE = Cylinder(np.array([0.1, -0.08, -0.5]), np.array([0.08, -0.08, 0.5]), 0.09)
 BLURRED = Candidate(PIPE, 0.002, 300, CloudEvidence(np.pi, 0.8, 0.0, 0.004, 0.0, 3.0))
 
 
@@ -45,16 +47,32 @@ def _boq(*radii: float) -> BillOfQuantities:
 def test_of_a_pipe_that_shows_one_side_the_plan_tells_the_radius(pipe_views: list[View]) -> None:
     """A neighbour hides its other side in all views; to the cloud it is 3 mm thicker, at 2 sigma, and too rough."""
     true = pipe_and_wall.PIPE
-    neighbour = Cylinder(np.array([0.1, -0.08, -0.5]), np.array([0.08, -0.08, 0.5]), 0.09)
     evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
     rough = Candidate(replace(true, radius=true.radius + 0.003), 0.0015, 3000, evidence)
     sides = [CandidateFitter(_boq(*radii), MeasurementCache()) for radii in ((true.radius, 0.1), (true.radius, 0.041))]
-    one, open_to_two = (fitter.of_visible_side(rough, [neighbour], pipe_views) for fitter in sides)
-    assert sides[0].fit(rough, [neighbour], pipe_views) is None
+    one, open_to_two = (fitter.of_visible_side(rough, [BEFORE], pipe_views) for fitter in sides)
+    assert sides[0].fit(rough, [BEFORE], pipe_views) is None
     assert one is not None
     assert open_to_two is None
     assert one.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
     assert np.linalg.norm(one.cylinder.from_axis(true.middle[None])[0]) < 3e-3
+
+
+@pytest.mark.parametrize(("thicker", "sigma"), [(0.003, 2e-4), (0.0005, 4e-3)])
+def test_of_one_side_the_planned_radius_near_it_is_measured(
+    pipe_views: list[View], thicker: float, sigma: float
+) -> None:
+    """A wrong radius that is told well, and one that is not told: the other pipe hides what would tell it."""
+    true = pipe_and_wall.PIPE
+    evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
+    rough = Candidate(replace(true, radius=true.radius + 0.006), 0.0015, 3000, evidence)
+    wrong = replace(true, radius=true.radius + thicker)
+    fit = ContourFit(wrong, np.eye(5), sigma, 1.0, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
+    fitter = CandidateFitter(_boq(true.radius), MeasurementCache())
+    measured = fitter.near_planned(rough, fit, [BEFORE], pipe_views)
+    assert measured is not None
+    assert measured is not fit
+    assert measured.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
 
 
 def test_a_fit_out_of_the_candidates_reach_gives_way_to_a_planned_one(monkeypatch: pytest.MonkeyPatch) -> None:
