@@ -95,7 +95,8 @@ def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
     """Of candidate steps (K, 5) the most probable one after a pass on sub-pixel edges; so improved.
 
     Two edges side by side are both seen all along the pipe; which one is its contour is told by where the pipe starts
-    from, too, with the precision `prior` (5, 5).
+    from, too, with the precision `prior` (5, 5). That start itself, the step 0, is only taken beside others where its
+    edges are more probable on a pipe than on texture.
     """
     trials = []
     for step in steps:
@@ -104,8 +105,9 @@ def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
             trials.append((step, -np.inf))
         else:
             samples, edges, solution = found
-            total = step + solution.step
-            trials.append((total, _log_odds(samples, edges, solution) - 0.5 * float(total @ prior @ total)))
+            total, odds = step + solution.step, _log_odds(samples, edges, solution)
+            if step.any() or odds > 0.0 or len(steps) == 1:
+                trials.append((total, odds - 0.5 * float(total @ prior @ total)))
     return max(trials, key=lambda trial: trial[1])[0]
 
 
