@@ -95,8 +95,8 @@ def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
     """Of candidate steps (K, 5) the most probable one after a pass on sub-pixel edges; so improved.
 
     Two edges side by side are both seen all along the pipe; which one is its contour is told by where the pipe starts
-    from, too, with the precision `prior` (5, 5). That start itself, the step 0, is only taken beside others where its
-    edges are more probable on a pipe than on texture.
+    from, too, with the precision `prior` (5, 5). Where edges are no more probable on a pipe than on texture, neither
+    this nor the start itself, the step 0, counts.
     """
     trials = []
     for step in steps:
@@ -106,8 +106,10 @@ def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
         else:
             samples, edges, solution = found
             total, odds = step + solution.step, _log_odds(samples, edges, solution)
-            if step.any() or odds > 0.0 or len(steps) == 1:
-                trials.append((total, odds - 0.5 * float(total @ prior @ total)))
+            if odds > 0.0:
+                trials.append((total, max(odds - 0.5 * float(total @ prior @ total), 0.0)))
+            elif step.any() or len(steps) == 1:
+                trials.append((total, odds))
     return max(trials, key=lambda trial: trial[1])[0]
 
 
