@@ -254,7 +254,8 @@ class DetectNode(Node):
         if newest is None or not self._supervision.takes_requests:
             return
         status, poses, velocities = newest.status, newest.poses, newest.velocities
-        final = self._finish.expected is not None and status.revision >= self._finish.expected
+        asked = self._finish.expected is not None and status.revision >= self._finish.expected
+        final = status.final or asked  # the final map may come before the request to finish, and is the same then
         if not (self._intermediate or final) or self._missing(poses):
             return
         self._maps.discard(newest)

@@ -175,7 +175,7 @@ class MapOutput:
         self._velocities: Publisher[msg.KeyframeVelocities] | None = None
         self._statuses = node.create_publisher(msg.SfmStatus, "sfm_status", qos.latched())
         self._cameras = node.create_publisher(CameraInfo, REFINED_CALIBRATION, qos.latched())
-        self._camera_refined = False
+        self._camera_refined = self._final = False
 
     def publish_overlap(
         self, header: Header, reports: Sequence[OverlapReport], keyframes: int, retired: int, readout: float
@@ -219,11 +219,11 @@ class MapOutput:
         self._poses.publish(messages.path(header, trajectory.stamps, trajectory.map_from_camera))
         return header
 
-    def publish_map(self, metric_map: MetricMap, camera_frame: str) -> None:
+    def publish_map(self, metric_map: MetricMap, camera_frame: str, *, final: bool) -> None:
         """Poses and cloud of a new map, and the camera where it was refined, all under the same stamp."""
         self.revision += 1
         header = self.publish_poses(metric_map.trajectory)
-        self._map_stamp = self.newest_stamp
+        self._map_stamp, self._final = self.newest_stamp, final
         self._camera_refined = metric_map.refined_camera is not None
         if metric_map.refined_camera is not None:
             self._cameras.publish(messages.info_from_camera(metric_map.refined_camera, self._map_stamp, camera_frame))
@@ -250,6 +250,7 @@ class MapOutput:
                 models=status.models,
                 map_revision=self.revision,
                 map_stamp=messages.time_msg(self._map_stamp),
+                map_final=self._final,
                 reprojection_error=status.reprojection_error,
                 metric=scale is not None,
                 scale_source=scale.source if scale else "",
@@ -407,7 +408,7 @@ class SfmNode(Node):
             self._supervision.answered()
             self._end_retirement(event.overlaps)
         elif isinstance(event, MapReady):
-            self._output.publish_map(event.map, self._camera_frame)
+            self._output.publish_map(event.map, self._camera_frame, final=event.final)
             self._note()
             self._publish_transform(event.map.trajectory)
         self._publish_status()

@@ -94,10 +94,11 @@ class Retired:
 
 @dataclass(frozen=True)
 class MapReady:
-    """Event: the map has changed."""
+    """Event: the map has changed; a `final` one is that of Finish."""
 
     status: Status
     map: MetricMap
+    final: bool = False
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,7 @@ def _finish(channel: Channel, reconstruction: Reconstruction, command: Finish) -
         metric_map = reconstruction.finish()
     except NotMetricError as error:
         return Finished(reconstruction.status(), str(error))
-    channel.send(MapReady(reconstruction.status(), metric_map))
+    channel.send(MapReady(reconstruction.status(), metric_map, final=True))
     if command.colmap:
         folder = Path(command.colmap)
         reconstruction.write_colmap(folder)

@@ -125,14 +125,20 @@ class Stage:
         self._infos.publish(info)
 
     def send_map(
-        self, stamp: int, revision: int, keyframes: list[int], points: FloatArray, readout: float = 0.0
+        self,
+        stamp: int,
+        revision: int,
+        keyframes: list[int],
+        points: FloatArray,
+        readout: float = 0.0,
+        final: bool = False,
     ) -> None:
         header = messages.header(stamp, "map")
         self._points.publish(messages.point_cloud(header, points, np.zeros((len(points), 3), np.uint8)))
         self._poses.publish(messages.path(header, np.array(keyframes), np.tile(np.eye(4), (len(keyframes), 1, 1))))
         status = msg.SfmStatus(map_revision=revision, scale_source="board", scale_sigma=0.0004)
         status.map_stamp = messages.time_msg(stamp)
-        status.readout = readout
+        status.readout, status.map_final = readout, final
         self._status.publish(status)
 
     def send_velocities(self, stamp: int, readout: float, linear: FloatArray) -> None:
@@ -268,6 +274,18 @@ def test_the_end_of_a_survey_waits_for_the_last_map(stage: Callable[..., Stage])
     assert end.result().outputs == 2
     scene.spin_until(lambda: scene.pipes)
     assert [message.map_revision for message in scene.pipes] == [2]
+
+
+def test_a_final_map_is_one_before_anybody_asks_for_the_end(stage: Callable[..., Stage]) -> None:
+    """Names of its pipes follow from their places, though it comes before the request and after a map of one pipe."""
+    scene, points = stage(), corner()
+    scene.send_map(START, 1, [], points[points[:, 0] > 1.1])
+    scene.spin_until(lambda: scene.pipes)
+    (earlier,) = scene.pipes[0].pipes
+    scene.send_map(START + STEP, 2, [], points, final=True)
+    scene.spin_until(lambda: len(scene.pipes) > 1)
+    names = [pipe.id for pipe in sorted(scene.pipes[1].pipes, key=lambda pipe: pipe.end.x)]
+    assert (earlier.id, names) == ("p01", ["p02", "p01", "p03"])
 
 
 def test_keyframes_that_are_no_images_are_left_out(stage: Callable[..., Stage]) -> None:

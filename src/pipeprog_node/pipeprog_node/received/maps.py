@@ -68,6 +68,7 @@ class ReceivedStatus:
     readout: float = 0.0
     camera_refined: bool = False
     circles: tuple[tuple[float, float, float, float], ...] = ()
+    final: bool = False
 
 
 def map_points(message: PointCloud2) -> ReceivedCloud:
@@ -175,6 +176,7 @@ def sfm_status(message: SfmStatus) -> ReceivedStatus:
         message.readout,
         message.camera_refined,
         _circles(message),
+        message.map_final,
     )
 
 
