@@ -39,7 +39,7 @@ DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with m
 SIGNIFICANT = 5.0  # standard deviations of a change: features share errors that the covariance knows in part only
 MAX_ITERATIONS = 15  # of Levenberg-Marquardt; 3 to 6 for a calibration, up to 12 for a guess, are needed
 CONVERGED = 0.1  # of its standard deviation, change of each number at which the iterations end
-STEP = 1e-6  # of numerical derivatives by rays, log focal length, k1 and k2: rounding gives them to 1e-9
+STEP = 1e-6  # of numerical derivatives by rays, k1 and k2: a forward difference errs by 1e-6, its rounding by 1e-7 px
 HELD = 1e-9  # standard deviation of a number that stays as it is
 # s, below which all rows count as exposed at once: 0.3 px at walking pace, and the fastest rolling shutters take 2 ms.
 LEAST_READOUT = 0.001
@@ -133,29 +133,32 @@ class _Problem:
         self.pixels = camera.distort_points(ideal)
         self.noise = model.noise
 
-    def residuals(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(K, 2) errors in units of the noise, (K, 3) points in the cameras' frames turned only, (K, 2) rays."""
+    def projected(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(K, 2) pixels, (K, 3) points in the cameras' frames turned only, (K, 2) rays."""
         turned = np.einsum("kij,kj->ki", state.rotation[self.view], state.points[self.owner])
         inside = turned + state.translation[self.view]
         rays = inside[:, :2] / np.maximum(inside[:, 2:], 1e-9)
-        measured = self.pixels + state.numbers[3] * self.rates
-        error = (pixels_of(changed(self.camera, state.numbers), rays) - measured) / self.noise
-        return error, turned, rays
+        return pixels_of(changed(self.camera, state.numbers), rays), turned, rays
+
+    def errors(self, state: _State, pixels: FloatArray) -> FloatArray:
+        """(K, 2) of projected pixels, in units of the noise."""
+        return (pixels - self.pixels - state.numbers[3] * self.rates) / self.noise
 
     def cost(self, state: _State, told: FloatArray) -> float:
         """Half of the sum of Cauchy losses, and of the prior's squares."""
-        error = self.residuals(state)[0]
+        error = self.errors(state, self.projected(state)[0])
         robust = CAUCHY**2 * np.log1p((error**2).sum(axis=1) / CAUCHY**2).sum()
         return 0.5 * float(robust + (((state.numbers - told) / self.prior) ** 2).sum())
 
     def linearised(self, state: _State) -> _Rows:
         """Rows at a state, with the square roots of the robust weights."""
-        error, turned, rays = self.residuals(state)
-        camera = changed(self.camera, state.numbers)
+        pixels, turned, rays = self.projected(state)
+        error, camera = self.errors(state, pixels), changed(self.camera, state.numbers)
         root = np.sqrt(1.0 / (1.0 + (error**2).sum(axis=1) / CAUCHY**2)) / self.noise
-        by_ray = _derivatives(lambda step: pixels_of(camera, rays + step), 2)
-        by_number = _derivatives(lambda step: pixels_of(changed(self.camera, state.numbers[:3] + step), rays), 3)
-        by_number = np.concatenate([by_number, -self.rates[:, :, None]], axis=-1)
+        by_ray = _derivatives(lambda step: pixels_of(camera, rays + step), pixels, 2)
+        by_focal = pixels - [camera.cx, camera.cy]  # its logarithm scales the image
+        by_lens = _derivatives(lambda step: pixels_of(changed(camera, np.append(0.0, step)), rays), pixels, 2)
+        by_number = np.concatenate([by_focal[:, :, None], by_lens, -self.rates[:, :, None]], axis=-1)
         depth = turned[:, 2] + state.translation[self.view, 2]
         slope = np.zeros((len(rays), 2, 3))
         slope[:, 0, 0] = slope[:, 1, 1] = 1.0
@@ -431,7 +434,6 @@ def _normal_equations(by_pose, by_number, by_point, residuals, start, view, coun
     return u, gu, v, gv, w, c, gc, uc, cv
 
 
-def _derivatives(function: Callable[[FloatArray], FloatArray], count: int) -> FloatArray:
-    """(K, 2, N) central differences of (K, 2) values by `count` numbers, at zero."""
-    steps = STEP * np.eye(count)
-    return np.stack([(function(step) - function(-step)) / (2 * STEP) for step in steps], axis=-1)
+def _derivatives(function: Callable[[FloatArray], FloatArray], values: FloatArray, count: int) -> FloatArray:
+    """(K, 2, N) differences of a function from its (K, 2) values at zero, by `count` numbers."""
+    return np.stack([(function(step) - values) / STEP for step in STEP * np.eye(count)], axis=-1)
