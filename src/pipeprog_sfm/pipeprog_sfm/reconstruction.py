@@ -25,7 +25,7 @@ from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.camera_in_use import CameraInUse, board_agrees, radial_warning
 from pipeprog_sfm.config import NOT_TOLD, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
-from pipeprog_sfm.dense.dense_mapper import DenseMapper, centre
+from pipeprog_sfm.dense.dense_mapper import DenseMapper, Registered, centre
 from pipeprog_sfm.dense.depth_fusion import FusedCloud
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import DISAGREEMENT, NoScaleError, ScaleEstimate
@@ -172,9 +172,7 @@ class Reconstruction:
 
     def update_dense(self) -> None:
         """Starts the depth maps that can be made by now; they are worked off in a thread of their own."""
-        poses = self._map.camera_from_model()
-        motions = self._map.motions(self._map.published)
-        self._dense.update(poses, self._images, self._map.points_seen, complete=False, motions=motions)
+        self._dense.update(self._registered(), complete=False)
 
     def move(self, motion: RobotMotion) -> None:
         """Takes what odometry, TF and IMU have told since the last call."""
@@ -289,10 +287,13 @@ class Reconstruction:
         """The map that was requested, once it is there; raises NotMetricError when there is no surface in it yet."""
         return self._take() if self._pending is not None and self._pending[2].done() else None
 
+    def _registered(self) -> Registered:
+        motions = self._map.motions(self._map.published)
+        return Registered(self._map.camera_from_model(), self._images, self._map.points_seen, motions)
+
     def _request(self, settled: bool, anew: bool) -> None:
         if settled:
-            poses, motions = self._map.camera_from_model(), self._map.motions(self._map.published)
-            self._dense.update(poses, self._images, self._map.points_seen, complete=True, motions=motions)
+            self._dense.update(self._registered(), complete=True)
         scale, trajectory = self._metric()
         camera_from_map = dict(zip(trajectory.stamps.tolist(), np.linalg.inv(trajectory.map_from_camera), strict=True))
         cloud = self._dense.fuse(camera_from_map, self._map.camera_from_model(), scale.scale, settled, anew)

@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import cv2
@@ -43,9 +43,40 @@ LEFT_BEHIND = 0.5
 # Share of a keyframe's points that too few depth maps show, from which on it gets its own: that is what the margins of
 # a swaying image show. The sample of its points tells it with a standard deviation of 0.014.
 MARGIN = 0.04
-NO_MOTIONS: Mapping[int, RowMotion] = {}  # of a global shutter
 STILL = RowMotion(0.0, 1, np.zeros(3), np.zeros(3))  # all rows at the stamp, however many there are
 SAME_SCALE = 1.5  # ratio of depths; a view that is nearer by more shows more detail
+
+
+@dataclass(frozen=True)
+class Registered:
+    """The registered keyframes, by stamp.
+
+    Attributes:
+        poses: (4, 4) camera_from_model.
+        images: at least theirs.
+        points: the (K, 3) points in the model that a keyframe sees.
+        motions: how a rolling shutter shows them, in the model's unit; empty without one.
+    """
+
+    poses: Mapping[int, FloatArray]
+    images: Mapping[int, EncodedImage]
+    points: Callable[[int], FloatArray]
+    motions: Mapping[int, RowMotion] = field(default_factory=dict)
+
+    def __contains__(self, stamp: int) -> bool:
+        return stamp in self.poses
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def view(self, stamp: int) -> tuple[FloatArray, Camera]:
+        """Pose and calibration of a keyframe."""
+        return self.poses[stamp], self.images[stamp].camera
+
+    def in_front(self, stamp: int) -> FloatArray:
+        """Of the points of a keyframe those before its camera, (K, 3)."""
+        pose, points = self.poses[stamp], self.points(stamp)
+        return points[points @ pose[2, :3] + pose[2, 3] > 0]
 
 
 @dataclass(frozen=True)
@@ -98,29 +129,17 @@ class DenseMapper:
     def __len__(self) -> int:
         return len(self._depths)
 
-    def update(
-        self,
-        poses: Mapping[int, FloatArray],
-        images: Mapping[int, EncodedImage],
-        points: Callable[[int], FloatArray],
-        complete: bool,
-        motions: Mapping[int, RowMotion] = NO_MOTIONS,
-    ) -> None:
+    def update(self, keyframes: Registered, complete: bool) -> None:
         """Starts depth maps of the keyframes that have come, unless others show the same.
 
-        Args:
-            poses: (4, 4) camera_from_model by stamp.
-            images: the keyframes by stamp.
-            points: the (K, 3) points in the model that a keyframe sees.
-            complete: no keyframe comes any more, so that the last ones need not wait for their neighbours.
-            motions: how a rolling shutter shows the keyframes, by stamp, in the model's unit; empty without one.
+        With `complete` no keyframe comes any more, so that the last ones need not wait for their neighbours.
         """
-        stamps = sorted(poses)
+        stamps = sorted(keyframes.poses)
         for stamp in stamps if complete else stamps[:-LOOKAHEAD]:
-            grown = len(poses) > 1.1 * self._refused.get(stamp, 0) + 2
+            grown = len(keyframes) > 1.1 * self._refused.get(stamp, 0) + 2
             if stamp not in self._depths and stamp not in self._covered and (grown or complete):
-                self._consider(stamp, poses, images, _in_front(poses[stamp], points(stamp)), motions)
-        self._settle(poses, images, points, complete, motions)
+                self._consider(stamp, keyframes)
+        self._settle(keyframes, complete)
         self._submit(all_of_them=complete)
 
     def retire(self, stamps: Collection[int]) -> None:
@@ -159,59 +178,41 @@ class DenseMapper:
                 maps[stamp] = (future, pose)
         return self._thread.submit(self._fuse, maps, dict(camera_from_model), scale, anew)
 
-    def _consider(
-        self,
-        stamp: int,
-        poses: Mapping[int, FloatArray],
-        images: Mapping[int, EncodedImage],
-        points: FloatArray,
-        motions: Mapping[int, RowMotion],
-    ) -> None:
+    def _consider(self, stamp: int, keyframes: Registered) -> None:
+        points = keyframes.in_front(stamp)
         if len(points) < MIN_POINTS:
-            self._refused[stamp] = len(poses)
+            self._refused[stamp] = len(keyframes)
             return
-        mapped = [other for other in self._depths if other in poses]
-        seen = overlap(_sample(points), poses[stamp], [(poses[other], images[other].camera) for other in mapped])
+        mapped = [other for other in self._depths if other in keyframes]
+        seen = overlap(_sample(points), keyframes.poses[stamp], [keyframes.view(other) for other in mapped])
         if len(seen) and seen.max() > self._overlap:
             self._covered[stamp] = mapped[int(seen.argmax())]
             self._unsettled.append(stamp)
             return
-        self._start(stamp, poses, images, points, motions)
+        self._start(stamp, keyframes, points)
 
-    def _settle(
-        self,
-        poses: Mapping[int, FloatArray],
-        images: Mapping[int, EncodedImage],
-        points: Callable[[int], FloatArray],
-        complete: bool,
-        motions: Mapping[int, RowMotion],
-    ) -> None:
+    def _settle(self, keyframes: Registered, complete: bool) -> None:
         """Starts depth maps of covered keyframes that show, at a margin, what too few others show.
 
         That is known once the walk has left behind what they show, or is complete.
         """
         while self._unsettled:
             stamp = self._unsettled[0]
-            if stamp in self._covered and stamp in poses:
-                sample = _sample(_in_front(poses[stamp], points(stamp)))
-                newest = max(poses)
-                if not complete and in_image(sample, [(poses[newest], images[newest].camera)]).mean() > LEFT_BEHIND:
+            if stamp in self._covered and stamp in keyframes:
+                points = keyframes.in_front(stamp)
+                sample = _sample(points)
+                newest = keyframes.view(max(keyframes.poses))
+                if not complete and in_image(sample, [newest]).mean() > LEFT_BEHIND:
                     return
-                mapped = [(poses[other], images[other].camera) for other in self._depths if other in poses]
+                mapped = [keyframes.view(other) for other in self._depths if other in keyframes]
                 missed = in_image(sample, mapped).sum(axis=0) < self._fusion_config.min_views
                 if missed.sum() > MARGIN * len(sample):
                     del self._covered[stamp]
-                    self._start(stamp, poses, images, _in_front(poses[stamp], points(stamp)), motions)
+                    self._start(stamp, keyframes, points)
             self._unsettled.popleft()
 
-    def _start(
-        self,
-        stamp: int,
-        poses: Mapping[int, FloatArray],
-        images: Mapping[int, EncodedImage],
-        points: FloatArray,
-        motions: Mapping[int, RowMotion],
-    ) -> None:
+    def _start(self, stamp: int, keyframes: Registered, points: FloatArray) -> None:
+        poses, images = keyframes.poses, keyframes.images
         depth = points @ poses[stamp][2, :3] + poses[stamp][2, 3]
         near, middle, far = np.percentile(depth, [1, 50, 99])
         # The sweep compares images of one size; a camera that switches its resolution has neighbours on either side.
@@ -220,11 +221,13 @@ class DenseMapper:
         alike = {other: one for other, one in poses.items() if working_size(images[other].camera, width) == size}
         pairs = choose_pairs(stamp, alike, float(middle), self._stereo_config)
         if not pairs:
-            self._refused[stamp] = len(poses)
+            self._refused[stamp] = len(keyframes)
             return
         # Surfaces without features lie beyond the sparse points' range as often as not.
         depth_range = (0.7 * float(near), 1.5 * float(far))
-        views = [_Source(other, images[other], poses[other], _motion(motions, other)) for other in [stamp, *pairs]]
+        views = [
+            _Source(other, images[other], poses[other], _motion(keyframes.motions, other)) for other in [stamp, *pairs]
+        ]
         future: Future[_Depth] = Future()
         self._depths[stamp] = future
 
@@ -323,11 +326,6 @@ def distance(camera_from_world: FloatArray, other_from_world: FloatArray) -> flo
 def centre(camera_from_world: FloatArray) -> FloatArray:
     """(3,) projection centre of a (4, 4) pose."""
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-
-
-def _in_front(camera_from_model: FloatArray, points: FloatArray) -> FloatArray:
-    """Of (K, 3) points those before the camera."""
-    return points[points @ camera_from_model[2, :3] + camera_from_model[2, 3] > 0]
 
 
 def _sample(points: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense import dense_mapper
-from pipeprog_sfm.dense.dense_mapper import DenseMapper, overlap
+from pipeprog_sfm.dense.dense_mapper import DenseMapper, Registered, overlap
 from pipeprog_sfm.types import EncodedImage
 
 WIDTH, HEIGHT = 240, 160
@@ -50,9 +50,9 @@ def walk(places: list[int]) -> tuple[DenseMapper, dict[int, np.ndarray], list[in
     counts = []
     for stamp, place in enumerate(places):
         poses[stamp], images[stamp] = pose(place), image(place)
-        dense.update(poses, images, lambda other: seen(poses[other]), complete=False)
+        dense.update(Registered(poses, images, lambda other: seen(poses[other])), complete=False)
         counts.append(len(dense))
-    dense.update(poses, images, lambda other: seen(poses[other]), complete=True)
+    dense.update(Registered(poses, images, lambda other: seen(poses[other])), complete=True)
     return dense, poses, [*counts, len(dense)]
 
 
@@ -122,7 +122,7 @@ def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
     after = len(dense)
     assert after < counts[-1]
     left = {stamp: matrix for stamp, matrix in poses.items() if stamp % 2 == 1}
-    dense.update(left, images, lambda other: seen(left[other]), complete=True)
+    dense.update(Registered(left, images, lambda other: seen(left[other])), complete=True)
     assert len(dense) > after
     assert len(dense.fuse(left, left, 1.0, complete=True, anew=True).result().points) > 1000
 
