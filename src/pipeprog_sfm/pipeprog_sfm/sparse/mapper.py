@@ -85,7 +85,7 @@ class Mapper:
         self._retry_near(stamp)
         close_loop(self.map, self._localizer, stamp)
         if len(self.map.models) > 1:
-            merge_models(self.map, self._localizer, stamp)
+            self._retry_from(stamp, merge_models(self.map, self._localizer, stamp))
         return self._report(stamp)
 
     def replace_features(self, stamp: int, features: Features) -> bool:
@@ -155,7 +155,7 @@ class Mapper:
             if len(self.map.waiting) >= before:
                 break
         for stamp in [stamp for model in sorted(self.map.models, key=len)[:-1] for stamp in model.stamps]:
-            merge_models(self.map, self._localizer, stamp)
+            self._retry_from(stamp, merge_models(self.map, self._localizer, stamp))
         for model in self.map.models:
             self.map.adjust_globally(model)
 
@@ -227,7 +227,11 @@ class Mapper:
 
     def _retry_near(self, stamp: int) -> None:
         """Tries the waiting keyframes nearest in time to a registered one."""
-        self._retry(sorted(self.map.waiting, key=lambda other: abs(other - stamp))[:RETRIES])
+        self._retry_from(stamp, self.map.waiting, RETRIES)
+
+    def _retry_from(self, stamp: int, stamps: list[int], count: int | None = None) -> None:
+        """Tries waiting keyframes, the nearest in time to `stamp` first, at most `count` of them."""
+        self._retry(sorted(stamps, key=lambda other: abs(other - stamp))[:count])
 
     def _retry(self, stamps: list[int]) -> None:
         for stamp in stamps:

@@ -13,25 +13,34 @@ from pipeprog_sfm.sparse.sparse_map import SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 DEPTH_TOLERANCE = 0.05  # relative difference of a point's depth in two models: its noise at the smallest ray angle
+AGREEING = 0.5  # share of the points of two models whose depths agree: with fewer one of the models is bent
 
 
-def merge_models(sparse_map: SparseMap, localizer: Localizer, stamp: int) -> None:
-    """Merges the keyframe's model with another one in which the keyframe can be located as well."""
+def merge_models(sparse_map: SparseMap, localizer: Localizer, stamp: int) -> list[int]:
+    """Merges the keyframe's model with another one in which the keyframe can be located as well.
+
+    Of two models that see the same points at other depths the smaller one, made of fewer views, is given up. Returns
+    the stamps of its keyframes, which wait to be registered anew; mostly none.
+    """
     own = sparse_map.model_of(stamp)
     if own is None:
-        return
+        return []
     keyframe = sparse_map.keyframes[stamp]
     for other in [model for model in sparse_map.models if model is not own]:
         similar = localizer.next_similar_views(other, keyframe)
         if not len(similar):
             continue
         location = localizer.locate_by(other, keyframe, similar)
-        found = similarity_between(own, own.stamps.index(stamp), other, location)
+        view = own.stamps.index(stamp)
+        found = similarity_between(own, view, other, location)
         if found is not None:
             removed, merged = merge(own, other, *found)
             sparse_map.models = [model for model in sparse_map.models if model is not removed]
             _connect(sparse_map, removed, merged, stamp)
-            return
+            return []
+        if len(_depths(own, view, other, location)) >= MIN_INLIERS / AGREEING:
+            return sparse_map.give_up(min(own, other, key=len))
+    return []
 
 
 def _connect(sparse_map: SparseMap, removed: SparseModel, merged: SparseModel, stamp: int) -> None:
@@ -57,20 +66,27 @@ def similarity_between(
 
     None where it was not located, or the depths of the points that both see through this view do not agree.
     """
+    own, theirs = _depths(source, view, target, location).T
     pose = location.camera_from_model
-    if pose is None:
+    if pose is None or not len(own):
         return None
-    used = location.pairs
-    mine = source.point_of[source.offsets[view] + used[:, 0]]
-    used, mine = used[mine >= 0], mine[mine >= 0]
+    ratio = theirs / own
+    scale = float(np.median(ratio))
+    if scale <= 0 or (np.abs(ratio / scale - 1) < DEPTH_TOLERANCE).sum() < max(MIN_INLIERS, AGREEING * len(ratio)):
+        return None
     own_pose = source.pose(view)
-    depth = source.points[mine] @ own_pose[2, :3] + own_pose[2, 3]
-    ratio = (target.points[used[:, 1]] @ pose[2, :3] + pose[2, 3]) / depth
-    scale = float(np.median(ratio)) if len(ratio) else 0.0
-    if scale <= 0 or (np.abs(ratio / scale - 1) < DEPTH_TOLERANCE).sum() < MIN_INLIERS:
-        return None
     own_pose[:3, 3] *= scale
     return scale, np.linalg.inv(pose) @ own_pose
+
+
+def _depths(source: SparseModel, view: int, target: SparseModel, location: Location) -> FloatArray:
+    """(K, 2) depths in both models of the points that both see through a view of the source located in the target."""
+    if location.camera_from_model is None:
+        return np.empty((0, 2))
+    used = location.pairs
+    mine = source.point_of[source.offsets[view] + used[:, 0]]
+    sides = (source, mine, source.pose(view)), (target, used[:, 1], location.camera_from_model)
+    return np.stack([model.points[ids] @ pose[2, :3] + pose[2, 3] for model, ids, pose in sides], axis=1)[mine >= 0]
 
 
 def merge(

@@ -66,6 +66,15 @@ class SparseMap:
         self.matches.pop(model.stamps[view], None)  # the two views that started the model have none
         model.drop(view)
 
+    def give_up(self, model: SparseModel) -> list[int]:
+        """Takes a model apart: its keyframes wait again. Returns their stamps."""
+        self.models.remove(model)
+        self.waiting += model.stamps
+        for stamp in model.stamps:
+            self.matches.pop(stamp, None)
+        self.revision += 1
+        return model.stamps
+
     def retire(self, stamps: Collection[int]) -> list[Keyframe]:
         """Takes keyframes out: pose and observations; returns them. Unknown stamps are ignored.
 
@@ -81,9 +90,7 @@ class SparseMap:
                 self.remove_view(model, model.stamps.index(keyframe.stamp))
         for model in list(self.models):
             if len(model) < 2:
-                self.waiting += model.stamps
-                self.models.remove(model)
-                self.revision += 1
+                self.give_up(model)
             elif stamps:
                 model.filter(*model.observations(np.ones(len(model.points), bool)))
         return retired

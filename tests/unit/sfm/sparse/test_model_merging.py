@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from scenes import STEP, in_model, keyframe, matched, started
 
-from pipeprog_sfm.sparse.model_merging import merge, similarity_between
+from pipeprog_sfm.features.retrieval import Retrieval
+from pipeprog_sfm.sparse.localizer import Localizer
+from pipeprog_sfm.sparse.model_merging import merge, merge_models, similarity_between
 from pipeprog_sfm.sparse.registration import add_view, locate
+from pipeprog_sfm.sparse.sparse_map import SparseMap
+from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 TOLERANCE = 0.02  # of the base: 0.3 px of 300 points at 2 m are some 3 mm of a view's place
 
@@ -37,3 +42,28 @@ def test_a_view_without_a_place_relates_nothing() -> None:
     model, other = started(0, 1), started(16, 17)
     location = locate(model, keyframe(16), {STEP: matched(keyframe(16), keyframe(1))}, seed=0)
     assert similarity_between(other, 0, model, location) is None
+
+
+def bent() -> SparseModel:
+    """A model of two views most of whose points lie at wrong depths."""
+    model = started(2, 3)
+    centre = model.centre(0)
+    wrong = np.random.default_rng(0).uniform(0.6, 1.6, len(model.points))
+    wrong[::3] = 1.0
+    model.points = centre + wrong[:, None] * (model.points - centre)
+    return model
+
+
+def test_a_model_that_contradicts_a_larger_one_is_given_up() -> None:
+    """A third of its points agree: that alone would join the models, and leave two views in wrong places for ever."""
+    straight, other = started(0, 1), bent()
+    fourth = keyframe(4)
+    location = locate(straight, fourth, {STEP: matched(fourth, keyframe(1))}, seed=0)
+    add_view(straight, fourth, location, {n * STEP: keyframe(n) for n in (0, 1, 4)})
+    sparse_map = SparseMap()
+    sparse_map.keyframes = {n * STEP: keyframe(n) for n in range(5)}
+    sparse_map.models = [other, straight]
+    localizer = Localizer(sparse_map.keyframes, Retrieval(), seed=0)
+    assert merge_models(sparse_map, localizer, 2 * STEP) == [2 * STEP, 3 * STEP]
+    assert sparse_map.models == [straight]
+    assert sparse_map.waiting == [2 * STEP, 3 * STEP]
