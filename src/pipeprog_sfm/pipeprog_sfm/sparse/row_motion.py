@@ -4,7 +4,7 @@
 The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
 are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
 (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). The ends of the
-trajectory, where a spline is poor, are corrected by what their own rows tell.
+trajectory, where a spline is poor, are corrected by what their own rows tell beside points that many views hold.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY
+from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, rotation_from_vector
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 MAX_GAP = 1.0  # s between two views that still tell the velocity between them: a hand sways at 1 to 2 Hz
@@ -37,6 +37,11 @@ NEAR = 16  # views nearest in time that tell how one moves: a knot has a quarter
 # spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
 END_CHANGE = 1.0
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
+MAX_STEPS = 10  # of Gauss-Newton: it converges in three to six
+CONVERGED = 0.01  # px, root mean square of a step over the points, a thirtieth of their noise
+# Views of a point that tells how one of them moves: with fewer, that view has too much say in where the point is, and
+# the point follows the view's own error.
+LONG_TRACK = 6
 MIN_POINTS = 50  # of a view, from which its own rows tell its velocity: twelve unknowns, and some wrong points
 
 
@@ -162,11 +167,14 @@ def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatAr
 def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion, sigma: float) -> RowMotion:
     """The motion that fits the view's points best, with that of the spline as the prior and the pose as it may be.
 
-    sigma: standard deviation of the spline's velocities, rad/s, and depths of the scene per second. One Gauss-Newton
-    step for pose and velocity, twelve unknowns: the columns of the velocity are those of the pose times the row's time.
+    sigma: standard deviation of the spline's velocities, rad/s, and depths of the scene per second. Gauss-Newton steps
+    for pose and velocity, twelve unknowns: the columns of the velocity are those of the pose times the row's time.
+    Where the spline is off by much, its rows are too, and count little by their robust weights: one step is not enough.
     """
-    features = np.flatnonzero(model.point_of[model.features(view)] >= 0)
-    inside = model.points[model.point_of[model.features(view)][features]] @ model.rotation[view].T
+    views = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points))
+    own = model.point_of[model.features(view)]
+    features = np.flatnonzero((own >= 0) & (views[own] >= LONG_TRACK))
+    inside = model.points[own[features]] @ model.rotation[view].T
     inside += model.translation[view]
     ahead = inside[:, 2] > 0
     features, inside = features[ahead], inside[ahead]
@@ -174,21 +182,31 @@ def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion
         return motion
     camera = keyframe.camera
     measured = keyframe.measured[features].astype(np.float64)
-    x, y, z = inside.T
-    shown = np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
-    error = motion.unrolled_pixels(measured, z, camera) - shown
-    by_point = np.zeros((len(z), 2, 3))
-    by_point[:, 0, 0], by_point[:, 1, 1] = camera.fx / z, camera.fy / z
-    by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
-    by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
     times = motion.row_times(camera.distort_points(measured)[:, 1])[:, None, None]
-    rows = np.concatenate([by_pose, times * by_pose], axis=2)
-    weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * model.noise) ** 2) / model.noise**2
-    normal = np.einsum("n,nij,nik->jk", weights, rows, rows)
-    depth = float(np.median(z))
-    normal[np.arange(6, 12), np.arange(6, 12)] += 1.0 / (sigma * np.repeat([1.0, depth], 3)) ** 2
-    change = np.linalg.solve(normal, np.einsum("n,nij,ni->j", weights, rows, error))[6:]
-    return replace(motion, angular=motion.angular + change[:3], linear=motion.linear + change[3:])
+    precision = 1.0 / (sigma * np.repeat([1.0, float(np.median(inside[:, 2]))], 3)) ** 2
+    moved = np.zeros(6)  # from the spline's velocities
+    fitted = motion
+    for _ in range(MAX_STEPS):
+        x, y, z = inside.T
+        shown = np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
+        error = fitted.unrolled_pixels(measured, z, camera) - shown
+        by_point = np.zeros((len(z), 2, 3))
+        by_point[:, 0, 0], by_point[:, 1, 1] = camera.fx / z, camera.fy / z
+        by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
+        by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
+        rows = np.concatenate([by_pose, times * by_pose], axis=2)
+        weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * model.noise) ** 2) / model.noise**2
+        normal = np.einsum("n,nij,nik->jk", weights, rows, rows)
+        normal[np.arange(6, 12), np.arange(6, 12)] += precision
+        pull = np.einsum("n,nij,ni->j", weights, rows, error)
+        pull[6:] -= precision * moved
+        change = np.linalg.solve(normal, pull)
+        inside = inside @ rotation_from_vector(change[None, :3])[0].T + change[3:6]
+        moved += change[6:]
+        fitted = replace(motion, angular=motion.angular + moved[:3], linear=motion.linear + moved[3:])
+        if np.sqrt(((rows @ change) ** 2).sum(axis=1).mean()) < CONVERGED:
+            break
+    return fitted
 
 
 def _velocities(stamps: list[int], rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
