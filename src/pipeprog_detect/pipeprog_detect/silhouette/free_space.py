@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import ViewArrays, in_image, project
+from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.occlusion import BEFORE, cylinder_rows, hidden_by_cylinders
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
@@ -21,8 +22,8 @@ STEP = 0.01
 MIN_VIEWS, MIN_SHARE = 3, 0.5
 # What is seen lies behind where it is farther from the axis than the inside of an open end, one radius, and a fifth.
 BEHIND_RADII = 1.2
-# A stretch whose contour, looked at this often [px], has support along more than half of it is no gap.
-SPACING, CONVINCING = 6, 0.5
+# A stretch whose contour is seen is no gap. It is looked at this often [px].
+SPACING = 6
 # Free stretches shorter than this [m] are left out: two cells of a view's depths.
 SHORTEST = 0.03
 
@@ -58,7 +59,7 @@ def free_stretches(cylinder: Cylinder, views: Sequence[View], others: Sequence[C
 
 def _shows_a_contour(stretch: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
     """Whether the views show the contour of a stretch: then a hole in the cloud of its face let them through."""
-    return Scene.of(stretch, views, others).support(spacing=SPACING).share >= CONVINCING
+    return Scene.of(stretch, views, others).support(spacing=SPACING).share >= MIN_SUPPORT
 
 
 def _looked_through(
