@@ -89,7 +89,7 @@ def installed_where_planned(planned: Sequence[PlannedPipe], found: Sequence[Foun
         ]
         if all(_common(theirs, ours) < _OVERLAP * (ours[1] - ours[0]) for theirs, ours in rivals):
             taken.append(pair)
-    return [_state(one, [pair for pair in taken if pair.planned == row], found) for row, one in enumerate(planned)]
+    return [_state(row, planned, taken, found) for row in range(len(planned))]
 
 
 def _within_reach(cylinder: Cylinder, found: Sequence[FoundPipe]) -> list[int]:
@@ -128,14 +128,28 @@ def _common(one: tuple[float, float], other: tuple[float, float]) -> float:
     return max(0.0, min(one[1], other[1]) - max(one[0], other[0]))
 
 
-def _state(planned: PlannedPipe, pairs: Sequence[_Pair], found: Sequence[FoundPipe]) -> PlannedState:
+def _state(
+    row: int, planned: Sequence[PlannedPipe], taken: Sequence[_Pair], found: Sequence[FoundPipe]
+) -> PlannedState:
+    """The state of the planned pipe `row`, by the pairs of all."""
+    one, pairs = planned[row], sorted((pair for pair in taken if pair.planned == row), key=lambda pair: pair.beside)
     if not pairs:
-        return PlannedState(planned, (), 0.0, 0.0, 0.0)
-    # Both ends off the same way tell a shift; a pipe hidden at one end, or measured as one with the next, tells none.
-    at_start = min(pair.on_planned[0] for pair in pairs)
-    at_end = max(pair.on_planned[1] for pair in pairs) - planned.cylinder.length
-    along = min(at_start, at_end, key=abs) if at_start * at_end > 0.0 else 0.0
-    length = min(sum(pair.beside[1] - pair.beside[0] for pair in pairs), planned.cylinder.length)
-    ordered = sorted(pairs, key=lambda pair: pair.beside)
-    ids, stretches = tuple(found[pair.found].id for pair in ordered), tuple(pair.beside for pair in ordered)
-    return PlannedState(planned, ids, length, max(pair.across for pair in pairs), along, stretches)
+        return PlannedState(one, (), 0.0, 0.0, 0.0)
+    length = min(sum(pair.beside[1] - pair.beside[0] for pair in pairs), one.cylinder.length)
+    ids, stretches = tuple(found[pair.found].id for pair in pairs), tuple(pair.beside for pair in pairs)
+    across, along = max(pair.across for pair in pairs), _along(one.cylinder, pairs, planned, taken)
+    return PlannedState(one, ids, length, across, along, stretches)
+
+
+def _along(own: Cylinder, pairs: Sequence[_Pair], planned: Sequence[PlannedPipe], taken: Sequence[_Pair]) -> float:
+    """The shift of a planned pipe along its axis [m]: what both ends are off by the same way, 0 where they are not.
+
+    A pipe hidden at one end tells none, nor does one measured as one with the next: its end there is the next one's.
+    """
+    first, last = min(pairs, key=lambda pair: pair.on_planned[0]), max(pairs, key=lambda pair: pair.on_planned[1])
+    for pair, outwards in ((first, -own.axis), (last, own.axis)):
+        next_ones = [planned[other.planned].cylinder.middle for other in taken if other.found == pair.found]
+        if any((middle - own.middle) @ outwards > 0.0 for middle in next_ones):
+            return 0.0
+    at_start, at_end = first.on_planned[0], last.on_planned[1] - own.length
+    return min(at_start, at_end, key=abs) if at_start * at_end > 0.0 else 0.0
