@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from pipeprog_bringup.commands.options import Force
-from pipeprog_bringup.commands.speech import say
+from pipeprog_bringup.commands.speech import note, say
 
 
 def export(
@@ -57,5 +57,7 @@ def export(
     alignment, told = (None, []) if points is None else site_alignment(folder, points, board)
     for sentence in told:
         say(sentence)
+    if alignment and alignment.warning:
+        note(alignment.warning)
     for path in write(folder, to, out or folder / "export", force, alignment):
         say(f"Written: {path}")

@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from pipeprog_bringup.commands.export import export as command
 from pipeprog_bringup.export.control_points import ControlPoint, ControlPointFile, align, load_control_points
 from pipeprog_bringup.export.formats import export, site_alignment
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.similarity import similarity
 from tests.unit.bringup.report.filmed import CAMERA, LEVEL, looking_along_y, run
 
 PLACES = np.array([[0.0, 0, 0], [9.0, 0.5, 0.2], [8.5, 6.0, 1.5], [0.5, 5.5, 2.8]])  # corners of a room, in the map
@@ -47,8 +50,100 @@ def test_a_wrong_point_is_named(seed: int, wrong: int) -> None:
     rng = np.random.default_rng(seed)
     xyz = on_site(PLACES) + rng.normal(0, 0.002, (4, 3))
     xyz[wrong] += 0.06 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, -0.8]])[seed % 4]
-    with pytest.raises(InputError, match=f"control point 'P{wrong + 1}' lies .* mm from where the others put it"):
+    with pytest.raises(InputError, match=f"^control point .*'P{wrong + 1}'"):
         align(points_at(xyz), PLACES)
+
+
+def four_points(rng: np.random.Generator, error: float) -> tuple[ControlPointFile, FloatArray, str]:
+    """Points of a room with noise of 2 mm, 1 m apart, one `error` m wrong; places in the map, name of the wrong one."""
+    while True:
+        places = rng.uniform([0.0, 0.0, 0.0], [6.0, 4.0, 2.5], (4, 3))
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)[np.triu_indices(4, 1)]
+        if gaps.min() > 1.0 and np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] > 0.5:
+            break
+    direction = rng.normal(size=3)
+    wrong = int(rng.integers(4))
+    xyz = on_site(places) + rng.normal(0, 0.002, (4, 3))
+    xyz[wrong] += error * direction / np.linalg.norm(direction)
+    return points_at(xyz), places, f"P{wrong + 1}"
+
+
+def test_of_four_points_one_that_is_50_mm_wrong_is_refused_though_the_fit_of_all_hides_it() -> None:
+    rng = np.random.default_rng(0)
+    hidden, alone = 0, 0
+    for _ in range(200):
+        points, places, name = four_points(rng, 0.05)
+        xyz = np.array([point.xyz for point in points.points])
+        fit = similarity(places, xyz, scaled=False)
+        hidden += np.linalg.norm(places @ fit[:3, :3].T + fit[:3, 3] - xyz, axis=1).max() < 0.015
+        with pytest.raises(InputError, match=f"^control point .*'{name}'") as caught:
+            align(points, places)
+        alone += str(caught.value).startswith(f"control point '{name}' lies")
+    assert hidden > 10
+    assert alone > 180
+
+
+def test_right_points_are_not_refused() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        points, places, _ = four_points(rng, 0.0)
+        align(points, places)
+
+
+def test_where_two_points_may_be_the_wrong_one_both_are_named() -> None:
+    """Four corners of a floor: whichever one is left out, the other three fit at any height."""
+    floor = np.array([[0.0, 0, 0], [5.0, 0, 0], [5.0, 4.0, 0], [0.0, 4.0, 0]])
+    xyz = on_site(floor)
+    xyz[2, 2] += 0.05
+    with pytest.raises(
+        InputError, match=r"^control point ('P[1-4]'( or )?){4} is wrong, without which the others agree"
+    ):
+        align(points_at(xyz), floor)
+
+
+def test_a_point_beside_a_line_of_others_is_named_without_a_distance() -> None:
+    places = np.array([[0.0, 0, 0], [3.0, 0.01, 0], [6.0, 0, 0], [3.0, 3.0, 1.0]])
+    xyz = on_site(places)
+    xyz[3] += 0.2 * SITE_FROM_MAP[:3, 0]
+    with pytest.raises(InputError, match="control point 'P4' is wrong, without which the others agree"):
+        align(points_at(xyz), places)
+
+
+SWAPPED = "easting and northing are swapped"
+MIRRORED = f"{SWAPPED}, or one of them has the wrong sign"
+
+
+@pytest.mark.parametrize("count", [3, 4])
+@pytest.mark.parametrize(
+    ("order", "signs", "told"),
+    [
+        ([1, 0, 2], [1, 1, 1], MIRRORED),
+        ([0, 1, 2], [-1, 1, 1], MIRRORED),
+        ([1, 0, 2], [1, 1, -1], f"{SWAPPED}, and the heights have the wrong sign"),
+        ([0, 1, 2], [1, 1, -1], "the heights have the wrong sign"),
+    ],
+)
+def test_axes_that_are_swapped_or_mirrored_are_told_and_no_point_is_blamed(
+    count: int, order: list[int], signs: list[int], told: str
+) -> None:
+    with pytest.raises(InputError, match=f"where {told}:"):
+        align(points_at(on_site(PLACES)[:count, order] * signs), PLACES[:count])
+
+
+def test_of_points_on_a_floor_swapped_axes_are_told_and_do_not_turn_the_map_upside_down() -> None:
+    floor = PLACES * [1.0, 1.0, 0.0]
+    with pytest.raises(InputError, match=f"where {MIRRORED}:"):
+        align(points_at(on_site(floor)[:, [1, 0, 2]]), floor)
+
+
+def test_of_three_points_those_further_off_than_three_times_the_noise_are_warned_of() -> None:
+    xyz = on_site(PLACES)[:3]
+    assert align(points_at(xyz), PLACES[:3]).warning == ""
+    away = xyz[1] - xyz[0]
+    xyz[1] += 0.02 * away / np.linalg.norm(away)
+    warning = align(points_at(xyz), PLACES[:3]).warning
+    assert "further off than 9 mm" in warning
+    assert "a fourth point would tell which is wrong" in warning
 
 
 def test_swapped_points_and_three_wrong_ones_are_told_with_their_distances() -> None:
@@ -78,18 +173,35 @@ def seen(place: FloatArray, pose: FloatArray) -> list[float]:
     return [float(value) for value in CAMERA.distort_points(ideal)[0]]
 
 
-def test_pixels_of_keyframes_give_the_site_s_coordinates(tmp_path: Path) -> None:
-    poses = [looking_along_y(x) for x in (-0.4, 0.0, 0.5)]
-    folder = run(tmp_path, poses)
+POSES = [looking_along_y(x) for x in (-0.4, 0.0, 0.5)]
+
+
+def clicked() -> tuple[FloatArray, list[dict[str, Any]]]:
+    """Four places in the map, and the points of a file that shows them by pixels of all keyframes of POSES."""
     places = np.array([[-0.5, 2.0, -0.4], [0.6, 2.2, -0.3], [0.5, 1.9, 0.5], [-0.4, 2.1, 0.4]])
     points = [
         {
             "name": f"P{k}",
-            "pixel": [[number, *seen(place, pose)] for number, pose in enumerate(poses, 1)],
+            "pixel": [[number, *seen(place, pose)] for number, pose in enumerate(POSES, 1)],
             "xyz": on_site(place[None])[0].tolist(),
         }
         for k, place in enumerate(places)
     ]
+    return places, points
+
+
+def test_the_command_warns_of_points_that_are_too_far_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = run(tmp_path, POSES)
+    places, points = clicked()
+    points[0]["xyz"] = on_site(places[:1] - [0.02, 0.0, 0.0])[0].tolist()
+    command(folder, ["csv"], tmp_path / "out", written(tmp_path, {"points": points[:3]}))
+    assert "Note: control points lie further off than 9 mm" in capsys.readouterr().err
+    assert (tmp_path / "out" / "classes.csv").exists()
+
+
+def test_pixels_of_keyframes_give_the_site_s_coordinates(tmp_path: Path) -> None:
+    folder = run(tmp_path, POSES)
+    places, points = clicked()
     path = written(tmp_path, {"crs": "EPSG:25832", "points": points})
     found, told = site_alignment(folder, path, None)
     assert found.site.crs == "EPSG:25832"
