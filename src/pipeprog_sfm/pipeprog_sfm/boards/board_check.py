@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each circle of a placed board triangulated by itself, and compared with the board's file."""
+"""Each circle of a placed board triangulated by itself and compared with the board's file, and circles not found."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from scipy.special import chdtri
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_sfm.boards.board_covariance import cauchy_weights
+from pipeprog_sfm.boards.board_detection import circles_in_image
 from pipeprog_sfm.boards.placed_board import CircleRows, PlacedBoard, PosedCamera
 
 FALSE_ALARM = 1e-4  # probability with which a board that agrees with its file is refused, for each of its circles
 MAX_STEPS = 10  # Gauss-Newton steps; the start is the board's fit, off by millimetres, and four steps settle it
+MISSED = 5  # images that have a circle's place in view; in fewer, blur or a passer-by may hide it by chance
 SINGULAR = 1e-9  # singular values below this share of the largest are left out: rays nearly parallel
 
 
@@ -79,4 +81,26 @@ def contradiction(place: PlacedBoard, residuals: CircleResiduals, tolerance: flo
         f"board {place.board.name} contradicts its file (circles off by {listed}; they should be right to "
         f"{1000 * tolerance:g} mm): measure its centres again, check that it is flat and the file is its own, "
         "or tell the read-out time of a rolling shutter (sfm.readout, in seconds)"
+    )
+
+
+def missed_circles(place: PlacedBoard, posed: PosedCamera) -> str:
+    """Which circles were not found where the file has them, a full sentence, or an empty text.
+
+    A centre that is wrong by more than half a radius leads to no ellipse: the circle takes no part, and is none of
+    those that `contradiction` compares, which are found in two images or more.
+    """
+    in_view, found = np.zeros((2, len(place.board.centres)), int)
+    for view in place.views:
+        camera_from_board = posed.poses[view.stamp] @ place.model_from_board
+        camera_from_board[:3] *= place.scale
+        in_view += circles_in_image(place.board, posed.camera, camera_from_board)
+        found[view.seen.indices] += 1
+    missed = np.flatnonzero((found < 2) & (in_view >= MISSED))
+    if not len(missed):
+        return ""
+    return (
+        f"board {place.board.name}: not found where its file has them, though {in_view[missed].min()} images or more "
+        f"show the place: circles {', '.join(str(number + 1) for number in missed)}; the others tell the scale: "
+        "measure these centres again, or uncover them"
     )

@@ -105,6 +105,14 @@ def detect_predicted_board(
     return _observation(ellipses, board, camera.matrix, fit) if len(fit.circles) else None
 
 
+def circles_in_image(board: Board, camera: Camera, camera_from_board: FloatArray) -> NDArray[np.bool_]:
+    """Which circles (N,) of a board at the pose (4, 4) [m] are wholly in the image, by MARGIN."""
+    centres, shapes = project_circles(camera.matrix, camera_from_board, board.centres, board.circle_radius)
+    reach = np.sqrt(np.abs(shapes[:, [0, 1], [0, 1]])) + MARGIN
+    within = (centres > reach) & (centres < np.array([camera.width, camera.height]) - reach)
+    return np.asarray(within.all(axis=1))
+
+
 def _observation(ellipses: ImageEllipses, board: Board, matrix: FloatArray, fit: BoardFit) -> BoardObservation:
     order = np.argsort(fit.circles)
     circles, members = fit.circles[order], fit.members[order]
@@ -217,10 +225,7 @@ def _verify(
     if len(fit.circles) < MIN_CIRCLES:
         return None
     # Of the circles that are wholly in the image more than half must be found; the others may be hidden.
-    centres, shapes = project_circles(matrix, fit.pose, board.centres, board.circle_radius)
-    reach = np.sqrt(np.abs(shapes[:, [0, 1], [0, 1]])) + MARGIN
-    within = ((centres > reach) & (centres < np.array([camera.width, camera.height]) - reach)).all(1)
-    return fit if 2 * len(fit.circles) > within.sum() else None
+    return fit if 2 * len(fit.circles) > circles_in_image(board, camera, fit.pose).sum() else None
 
 
 def _area(corners: FloatArray) -> float:

@@ -11,7 +11,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
 from pipeprog_sfm.boards.board_adjustment import PlacementSensitivity, placement_sensitivity
-from pipeprog_sfm.boards.board_check import circle_residuals, contradiction
+from pipeprog_sfm.boards.board_check import circle_residuals, contradiction, missed_circles
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.board_triangulation import place_boards
 from pipeprog_sfm.boards.ellipses import ImageEllipses
@@ -53,12 +53,14 @@ class CheckedBoards:
         sensitivities: how errors of images and poses propagate to each of them.
         refused: why others are not used, in full sentences.
         reason: one word with underscores, where none is left: no_board, too_few_views or contradiction.
+        missed: circles of sound boards that were not found where their file has them, in full sentences.
     """
 
     sound: tuple[PlacedBoard, ...] = ()
     sensitivities: tuple[PlacementSensitivity, ...] = ()
     refused: tuple[str, ...] = ()
     reason: str = ""
+    missed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -123,4 +125,5 @@ class PosedEvidence:
         sound = tuple(place for place, fault in zip(placed, faults, strict=True) if not fault)
         sensitivities = tuple(placement_sensitivity(place, posed) for place in sound)
         refused = tuple(fault for fault in faults if fault)
-        return CheckedBoards(sound, sensitivities, refused, "" if sound else "contradiction")
+        missed = tuple(filter(None, (missed_circles(place, posed) for place in sound)))
+        return CheckedBoards(sound, sensitivities, refused, "" if sound else "contradiction", missed)

@@ -52,7 +52,8 @@ def boards(posed: PosedEvidence) -> list[Measurement | ScaleWarning]:
         for stamp, derivative in sensitivity.derivatives.items():
             gradient[row[stamp]] = -derivative[6]
         found.append(Measurement("board", f"board {place.board.name}", float(np.log(place.scale)), sigma, gradient))
-    return [*found, *(ScaleWarning(text, posed.boards.reason) for text in posed.boards.refused)]
+    found += [ScaleWarning(text, posed.boards.reason) for text in posed.boards.refused]
+    return found + [ScaleWarning(text) for text in posed.boards.missed]
 
 
 def known_distances(posed: PosedEvidence) -> list[Measurement | ScaleWarning]:

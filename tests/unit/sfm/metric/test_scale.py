@@ -13,6 +13,7 @@ from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_check import circle_residuals
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile, KnownDistance
+from pipeprog_sfm.boards.ellipses import ImageEllipses
 from pipeprog_sfm.boards.placed_board import PosedCamera
 from pipeprog_sfm.config import BoardConfig
 from pipeprog_sfm.metric.map_frame import Vertical, board_vertical
@@ -27,10 +28,10 @@ from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covar
 CONFIG = BoardConfig()
 
 
-def told(walk, boards=(BOARD,), config=CONFIG, distances=()):
-    seen = {stamp: detect_boards(ellipses, boards, CAMERA) for stamp, ellipses in walk.ellipses.items()}
+def told(walk, boards=(BOARD,), config=CONFIG, distances=(), camera=CAMERA):
+    seen = {stamp: detect_boards(ellipses, boards, camera) for stamp, ellipses in walk.ellipses.items()}
     evidence = ScaleEvidence(BoardFile(boards, distances), seen, walk.ellipses)
-    return estimate_scale(PosedEvidence(evidence, walk.poses, CAMERA, config))
+    return estimate_scale(PosedEvidence(evidence, walk.poses, camera, config))
 
 
 @settings(max_examples=8, deadline=None)
@@ -227,6 +228,29 @@ def test_of_two_boards_the_bent_one_is_refused_and_the_other_counts():
     assert "board B contradicts its file" in estimate.warnings[0]
     assert "3: " in estimate.warnings[0]
     assert abs(estimate.scale * walk.factor - 1) < 4 * estimate.sigma
+
+
+def test_circles_that_lie_elsewhere_than_in_the_file_are_told_and_the_others_tell_the_scale():
+    centres = BOARD.centres.copy()
+    centres[2] += [0.09, 0.06, 0.0]
+    centres[4] += [0.0, 0.03, 0.0]
+    walk = Walk(7, views=10, noise=0.03, pose_noise=0.0003)
+    estimate = told(walk, (Board("A", BOARD.circle_radius, centres),))
+    assert [text for text in estimate.warnings if "not found where its file has them" in text] == [
+        "board A: not found where its file has them, though 10 images or more show the place: circles 3, 5; the others "
+        "tell the scale: measure these centres again, or uncover them"
+    ]
+    assert abs(estimate.scale * walk.factor - 1) < 4 * estimate.sigma
+
+
+def test_circles_beyond_the_edge_of_the_image_are_not_missed_but_those_that_something_covers_are():
+    walk = Walk(7, views=10, noise=0.03, pose_noise=0.0003, follow=0.0)
+    for stamp, seen in walk.ellipses.items():
+        left = seen.centres[:, 0] < 360.0  # circles 1, 3 and 4
+        walk.ellipses[stamp] = ImageEllipses(seen.centres[left], seen.shapes[left], seen.rms[left])
+    (warning,) = told(walk).warnings
+    assert "circles 2, 5" in warning
+    assert not told(walk, camera=replace(CAMERA, width=370)).warnings
 
 
 def test_without_anything_that_tells_the_vertical_there_is_no_map():
