@@ -14,14 +14,14 @@ from pipeprog_bringup.commands.speech import say_json
 
 def score(
     pipes: Annotated[
-        Path, typer.Argument(help="pipes.json of a run. Example: `out/demo/pipes.json`", metavar="DIR/pipes.json")
+        Path, typer.Argument(help="pipes.json of a run, or its folder. Example: `out/demo`", metavar="DIR/pipes.json")
     ],
     truth: Annotated[Path, typer.Argument(help="Ground truth. Example: `bags/demo.truth.json`", metavar="TRUTH.json")],
     as_json: AsJson = False,
 ) -> None:
     """Compare a result with ground truth: found, classified, radius, length, scale, trajectory.
 
-    `pipeprog score out/demo/pipes.json bags/demo.truth.json`
+    `pipeprog score out/demo bags/demo.truth.json`
     """
     from pipeprog_bringup.console import print_score
     from pipeprog_bringup.results.scoring import score_files

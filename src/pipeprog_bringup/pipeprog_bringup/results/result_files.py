@@ -107,7 +107,7 @@ def write_pipes(
 
 
 def write_progress(path: Path, product: Product, coverage: SurveyCoverage | None = None) -> None:
-    """progress.csv: one line a class, for a spreadsheet."""
+    """progress.csv: one line a class, for programs; spreadsheets of all locales read the classes.csv of the export."""
     names = [entry.name for entry in product.classes]
     seen: list[dict[str, float | None]] = [{} for _ in names]
     if coverage is not None:

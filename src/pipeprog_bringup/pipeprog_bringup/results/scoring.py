@@ -36,9 +36,12 @@ SIGMAS = 3.0
 def score_files(pipes_json: Path, truth_json: Path) -> dict[str, Any]:
     """Score `pipes_json`, aligned by the trajectory.tum and frames.csv beside it (identity where there is none).
 
-    Frames correspond by their number: row i of frames.csv is the truth's pose i. Raises InputError where a file cannot
-    be read or the trajectory cannot be laid onto the truth.
+    The folder of these files may be given in place of `pipes_json`. Frames correspond by their number: row i of
+    frames.csv is the truth's pose i. Raises InputError where a file cannot be read or the trajectory cannot be laid
+    onto the truth.
     """
+    if pipes_json.is_dir():
+        pipes_json /= "pipes.json"
     result, truth = read_result(pipes_json), read_truth(truth_json)
     trajectory_file = pipes_json.parent / "trajectory.tum"
     trajectory = None

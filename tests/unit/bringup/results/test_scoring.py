@@ -264,6 +264,14 @@ def test_files_are_aligned_by_their_trajectory(tmp_path: Path) -> None:
     json.dumps(figures, allow_nan=False)
 
 
+def test_a_results_folder_is_scored_as_its_pipes_json(tmp_path: Path) -> None:
+    pipes, truth = write_case(tmp_path, WORLD_FROM_MAP, [1, 4, 5, 9, 15, 19])
+    assert score_files(tmp_path, truth) == score_files(pipes, truth)
+    pipes.unlink()
+    with pytest.raises(InputError, match=r"no such file: .*pipes\.json"):
+        score_files(tmp_path, truth)
+
+
 def test_without_a_trajectory_the_frames_are_taken_as_one(tmp_path: Path) -> None:
     pipes, truth = write_case(tmp_path, np.eye(4), [0, 1, 2])
     (tmp_path / "trajectory.tum").unlink()
