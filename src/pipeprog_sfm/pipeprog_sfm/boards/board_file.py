@@ -72,11 +72,13 @@ class BoardFile:
         boards: flat boards with circles.
         distances: measured between circles of boards.
         scale_bars: pairs of discs.
+        path: of the file, for messages.
     """
 
     boards: Sequence[Board] = ()
     distances: Sequence[KnownDistance] = ()
     scale_bars: Sequence[ScaleBar] = ()
+    path: str = "the board file"
 
 
 def load_board_file(path: str | Path) -> BoardFile:
@@ -118,7 +120,7 @@ def load_board_file(path: str | Path) -> BoardFile:
         _scale_bar(entry, f"{path}{line_of(entries['marks'], number - 1)}: marks {number}", f"marks {number}")
         for number, entry in enumerate(entries["marks"], 1)
     ]
-    return BoardFile(tuple(boards), tuple(distances), tuple(bars))
+    return BoardFile(tuple(boards), tuple(distances), tuple(bars), str(path))
 
 
 def _check_counts(path: str | Path, entries: Mapping[str, list[Any]]) -> None:

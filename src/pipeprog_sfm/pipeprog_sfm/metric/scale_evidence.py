@@ -113,7 +113,10 @@ class PosedEvidence:
         images = sum(stamp in self.poses and len(found) > 0 for stamp, found in self.seen.observations.items())
         if not images:
             names = ", ".join(board.name for board in boards)
-            text = f"no board ({names}) was identified in any of {len(self.poses)} images with a pose"
+            text = (
+                f"no board ({names}) was identified in any of {len(self.poses)} images with a pose: is "
+                f"{self.seen.board_file.path} that of the board that hangs, and is the board near, sharp and lit?"
+            )
             return CheckedBoards(refused=(text,), reason="no_board")
         posed = self.posed_camera
         placed = self.placed

@@ -294,8 +294,9 @@ def test_reasons_for_no_scale():
     walk = Walk(8)
     with pytest.raises(NoScaleError, match="nothing tells the scale") as caught:
         estimate_scale(PosedEvidence(ScaleEvidence(), walk.poses, CAMERA, CONFIG))
-    with pytest.raises(NoScaleError, match="B") as caught:
-        told(walk, (LOPSIDED,))
+    evidence = ScaleEvidence(BoardFile((LOPSIDED,), path="other.yaml"))
+    with pytest.raises(NoScaleError, match=r"no board \(B\) .* is other\.yaml that of the board that hangs") as caught:
+        estimate_scale(PosedEvidence(evidence, walk.poses, CAMERA, CONFIG))
     assert caught.value.reason == "no_board"
     walk.poses = {0: walk.poses[0]}
     with pytest.raises(NoScaleError) as caught:
