@@ -301,7 +301,11 @@ class FramesNode(Node):
         if outside:
             self.get_logger().info(f"{len(outside)} keyframes are outside the band: frame_decisions has the reasons")
         published = len(self._ledger.published)
-        self._finish.answer(published, "" if published else "no image could be used as a keyframe: see frame_decisions")
+        nothing = (
+            "no image could be used as a keyframe: are they sharp, lit and of surfaces with texture, and does "
+            "CameraInfo fit them?"
+        )
+        self._finish.answer(published, "" if published else nothing)
 
     def _decide(self, selected: Selected) -> None:
         """Announces what became of frames and queues those that were chosen."""

@@ -415,6 +415,17 @@ def test_in_lockstep_every_image_is_decided_on(stage: Callable[..., Stage], wall
     assert "300 characters" in said[sent[15]]
 
 
+def test_a_survey_without_a_keyframe_ends_with_a_remedy(stage: Callable[..., Stage]) -> None:
+    scene = stage()
+    scene.show(START, compressed(START, np.full((360, 640), 120, np.uint8)))
+    finish = scene.others.create_client(Finish, "frames/finish")
+    scene.spin_until(finish.service_is_ready)
+    end = finish.call_async(Finish.Request(expected_inputs=1))
+    scene.spin_until(end.done)
+    assert not end.result().success
+    assert "are they sharp, lit and of surfaces with texture" in end.result().message
+
+
 def test_a_network_takes_a_recording(stage: Callable[..., Stage]) -> None:
     with pytest.raises(InputError, match="pipeprog replay"):
         stage("-p", "policy:=network")
