@@ -172,7 +172,13 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("options", "reason"),
-    [(["--board", str(BOARD)], "no board (A) was identified"), ([], "nothing tells the scale")],
+    [
+        (
+            ["--board", str(BOARD)],
+            f"no board (A) of {BOARD} was seen in 8 frames of 8, and nothing else tells the scale",
+        ),
+        ([], "nothing tells the scale"),
+    ],
     ids=["out of view", "not given"],
 )
 def test_without_a_board_the_reason_is_reported_and_nothing_written(

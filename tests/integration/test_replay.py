@@ -41,7 +41,7 @@ from pipeprog_bringup import cli, replay
 from pipeprog_bringup.playback.node_processes import NODE_MODULES
 fakes = dict.fromkeys(NODE_MODULES, "tests.integration.fake_node")
 run = replay.replay
-replay.replay = lambda request, report: run(request, report, fakes)
+replay.replay = lambda request, report, tell: run(request, report, tell, fakes)
 sys.argv[0] = "pipeprog"
 cli.main()
 """
@@ -72,7 +72,8 @@ def write_bag(path: Path, frames: int = 23, damaged: int | None = None, motion: 
     return path
 
 
-BOARD = "boards: [{name: A, circle_radius_mm: 20, centres_mm: [[0, 0], [200, 0], [0, 150]]}]\n"
+# No board, since a recording of noise would be refused for showing none.
+BOARD = "marks: [{circle_radius_mm: 50, distance_mm: 2134.0, sigma_mm: 1}]\n"
 
 
 def start(folder: Path, *options: str, fault: str = "", **recording: int) -> subprocess.Popen[str]:

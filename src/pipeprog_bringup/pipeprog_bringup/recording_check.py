@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can be told of a recording before a survey: by `pipeprog check`, and at the start of each replay.
 
-A survey needs at least four images, some that are not black, and something that tells the scale.
+A survey needs at least four images, some that show something, a camera that moves, and something that tells the scale.
 """
 
 from __future__ import annotations
@@ -22,8 +22,11 @@ from pipeprog_bringup.frame_quality import REMEDIES, fault_of
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.frame_check import ImageMessage
-from pipeprog_camera.camera import Camera
 from pipeprog_camera.raw_image import SAMPLES
+from pipeprog_frames.corners import corners
+from pipeprog_frames.incoming.decoding import reduce_image
+from pipeprog_frames.tracker import MIN_CORNERS
+from pipeprog_sfm.boards.board import Board
 from pipeprog_sfm.boards.board_detection import detect_boards
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.ellipses import detect_ellipses
@@ -33,8 +36,13 @@ MIN_FRAMES = 4  # points and outlines count where three views agree; of three im
 SCALE_TOPICS = {"odometry", "/tf", "/tf_static"}  # of the graph; odometry, odometry in TF, the bodies of a camera rig
 _SAMPLE = 12  # frames looked at: a board that a third of the frames show is missed once in 130 recordings
 _SECONDS = 3.0  # for reading at the start of a replay; what is not read by then counts for nothing
+_SEARCH_SECONDS = 3.0  # for boards in all frames: some 200 of 720p. Of CPU time: the same frames on a busy machine
 _BLACK = 12.0  # mean of 0..255; a lens cap gives 0 to 5, a cellar lit by one lamp 20 and more
 _MANY = 1 / 3  # of the frames looked at: of three neighbours, which must agree, more than one is lost then
+# Grey levels, mean difference of two thumbnails. One scene before a camera that stands: 0.5 with noise of three levels;
+# frames of the recordings in which a camera walks: 11 and more.
+_SAME = 1.0
+_THUMBNAIL = 80, 45  # px; averages 256 pixels at 720p, and their noise with them
 _RESULT_SHARE = 14  # bytes of results for each byte of a recording of JPEG images (docs/fleet.md)
 
 
@@ -47,19 +55,57 @@ class Findings:
     notes: list[str] = field(default_factory=list)
 
 
-def faults_of(bag: Bag, board_file: BoardFile) -> list[str]:
-    """Why a survey of a recording cannot give a result, in a few seconds; empty where none is known."""
-    return [*_without_images(bag, board_file), *_black(_samples(bag, _SECONDS)[0])]
+@dataclass(frozen=True)
+class _BoardSearch:
+    """Which boards frames show.
+
+    Attributes:
+        seen: in how many of the frames each board is seen.
+        frames: how many were looked at.
+        is_complete: whether a survey has no others than these.
+    """
+
+    seen: dict[str, int]
+    frames: int
+    is_complete: bool
+
+
+def first_look(bag: Bag, board_file: BoardFile, config: BoardConfig, has_reference: bool) -> Findings:
+    """What is told at the start of a replay, within seconds: faults, and notes where no board was seen; no facts.
+
+    Args:
+        bag: one camera, or a rig, of which one camera without a fault is enough.
+        board_file: boards and scale bars.
+        config: how boards are looked for.
+        has_reference: whether an earlier survey may tell the scale.
+    """
+    cameras = bag.rig or (bag,)
+    each = []
+    for camera in cameras:
+        samples, _, _ = _samples(camera, _SECONDS / len(cameras))
+        # Of a rig that stands, several cameras may show one place.
+        spoilt = _without_content(samples) or ([] if bag.rig else _still(samples))
+        boards = [] if spoilt else board_file.boards
+        search = _search_boards(camera, samples, boards, config, _SEARCH_SECONDS / len(cameras))
+        judged = _judged(camera, board_file, spoilt, search, has_reference)
+        if search.frames and not any(search.seen.values()):
+            judged.notes += _poor(samples, Counter(map(fault_of, samples)))
+        each.append(judged)
+    return Findings(
+        faults=each[0].faults if all(one.faults for one in each) else [],
+        notes=each[0].notes if all(one.notes for one in each) else [],
+    )
 
 
 def check(bag: Bag, board_file: BoardFile, size: int) -> Findings:
     """All that can be told of a recording of `size` bytes: each frame is read, and some are looked into."""
     samples, stamps, unusable = _samples(bag, float("inf"))
     seconds = (max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0
-    seen = _boards_in(samples, bag.camera, board_file)
+    spoilt = _without_content(samples) or _still(samples)
+    search = _search_boards(bag, samples, [] if spoilt else board_file.boards, BoardConfig(), _SEARCH_SECONDS)
     poor = Counter(map(fault_of, samples))
-    motion = sorted(bag.motion_topics.values())
-    findings = Findings(
+    judged = _judged(bag, board_file, spoilt, search, has_reference=False)
+    return Findings(
         {
             "image_topic": bag.image_topic,
             "camera_info_topic": bag.camera_info_topic,
@@ -73,26 +119,15 @@ def check(bag: Bag, board_file: BoardFile, size: int) -> Findings:
             "frames_sampled": len(samples),
             "black": sum(map(_is_dark, samples)),
             **{kind: poor[kind] for kind in REMEDIES},
-            "boards_seen": seen,
-            "motion": motion,
+            "frames_searched": search.frames,
+            "boards_seen": {board.name: search.seen.get(board.name, 0) for board in board_file.boards},
+            "motion": sorted(bag.motion_topics.values()),
             "result_mb": round(_RESULT_SHARE * size / 1e6),
             "memory_mb": foreseen(size, None),
         },
-        [*_without_images(bag, board_file), *_black(samples)],
-        [*bag.notes, *bag.losses],
+        judged.faults,
+        [*bag.notes, *bag.losses, *judged.notes, *([] if spoilt else _poor(samples, poor))],
     )
-    if board_file.boards and samples and not any(seen.values()):
-        text = f"no board was seen in {len(samples)} frames of {len(stamps)}"
-        if SCALE_TOPICS & set(motion) or len(samples) < len(stamps):
-            findings.notes.append(f"{text}: is it the right file, and is the board in view, near, sharp and lit?")
-        else:
-            findings.faults.append(f"{text}, and nothing else tells the scale: film the board, or name its file")
-    findings.notes += [
-        f"{poor[kind]} of {len(samples)} frames looked at are {remedy}"
-        for kind, remedy in REMEDIES.items()
-        if poor[kind] > _MANY * len(samples)
-    ]
-    return findings
 
 
 def recording_size(path: Path) -> int:
@@ -100,20 +135,33 @@ def recording_size(path: Path) -> int:
     return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]) if file.is_file())
 
 
-def _without_images(bag: Bag, board_file: BoardFile) -> list[str]:
-    """The faults that need no look into an image."""
-    faults = []
+def _judged(
+    bag: Bag, board_file: BoardFile, spoilt: Sequence[str], search: _BoardSearch, has_reference: bool
+) -> Findings:
+    """Faults of what one camera has recorded, and a note where no board was seen and that may not matter."""
+    findings = Findings()
     if bag.image_count < MIN_FRAMES:
-        faults.append(
+        findings.faults.append(
             f"{bag.path} has {bag.image_count} images on {bag.image_topic}: a survey needs {MIN_FRAMES} at the very "
             "least, and about one for each 20 cm of the way"
         )
-    has_target = board_file.boards or board_file.scale_bars
-    if not has_target and not SCALE_TOPICS & set(bag.motion_topics.values()):
-        faults.append(
+    findings.faults += spoilt
+    told = has_reference or bool(board_file.scale_bars) or bool(SCALE_TOPICS & set(bag.motion_topics.values()))
+    if not (told or board_file.boards):
+        findings.faults.append(
             f"nothing tells the scale of {bag.path}: hang up a board and name its file with --board, or record odometry"
         )
-    return faults
+    if not search.frames or any(search.seen.values()):
+        return findings
+    names = ", ".join(search.seen)
+    text = f"no board ({names}) of {board_file.path} was seen in {search.frames} frames of {bag.image_count}"
+    remedy = "is it the file of the board that hangs, and is the board in view, near, sharp and lit?"
+    # By a focal length that is a guess, boards may be found only once the survey has refined it.
+    if told or not search.is_complete or bag.focal_sigma is not None:
+        findings.notes.append(f"{text}: {remedy}")
+    else:
+        findings.faults.append(f"{text}, and nothing else tells the scale: {remedy}")
+    return findings
 
 
 def _samples(bag: Bag, limit: float) -> tuple[list[NDArray[np.uint8]], list[int], int]:
@@ -151,21 +199,68 @@ def _is_dark(gray: NDArray[np.uint8]) -> bool:
     return bool(gray.mean() < _BLACK)
 
 
-def _black(samples: Sequence[NDArray[np.uint8]]) -> list[str]:
-    if not samples or not all(map(_is_dark, samples)):
+def _without_content(samples: Sequence[NDArray[np.uint8]]) -> list[str]:
+    """The fault of frames of which the selector takes none: they are black, or show no corners that it can follow."""
+    if not samples:
         return []
-    return [f"all {len(samples)} frames looked at are black: was the lens covered, or the light off?"]
+    if all(map(_is_dark, samples)):
+        return [f"all {len(samples)} frames looked at are black: was the lens covered, or the light off?"]
+    if any(len(corners(reduce_image(image))) >= MIN_CORNERS for image in samples):
+        return []
+    kind = Counter(map(fault_of, samples)).most_common(1)[0][0]
+    remedy = REMEDIES.get(kind, "without texture: film surfaces that are not bare")
+    return [f"no frame of {len(samples)} looked at shows {MIN_CORNERS} corners, as a keyframe must: they are {remedy}"]
 
 
-def _boards_in(samples: Sequence[NDArray[np.uint8]], camera: Camera, board_file: BoardFile) -> dict[str, int]:
-    """In how many of the frames each board is seen."""
-    seen = {board.name: 0 for board in board_file.boards}
-    if not seen:
-        return seen
-    for image in samples:
-        if image.shape != (camera.height, camera.width):
-            continue
-        ellipses = detect_ellipses(image, camera, BoardConfig())
-        for name in {one.board for one in detect_boards(ellipses, board_file.boards, camera)}:
+def _still(samples: Sequence[NDArray[np.uint8]]) -> list[str]:
+    """The fault of frames that all show one image: nothing has a depth then."""
+    if len(samples) < MIN_FRAMES:
+        return []
+    first, *others = (cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(float) for image in samples)
+    if max(np.abs(other - first).mean() for other in others) >= _SAME:
+        return []
+    return [
+        f"all {len(samples)} frames looked at show the same image: did the camera stand, or send its last image again? "
+        "walk along the pipes"
+    ]
+
+
+def _poor(samples: Sequence[NDArray[np.uint8]], counts: Counter[str]) -> list[str]:
+    """Notes on what keeps many of the frames from being measured; `counts`: how many, by keys of REMEDIES."""
+    return [
+        f"{counts[kind]} of {len(samples)} frames looked at are {remedy}"
+        for kind, remedy in REMEDIES.items()
+        if counts[kind] > _MANY * len(samples)
+    ]
+
+
+def _search_boards(
+    bag: Bag, samples: Sequence[NDArray[np.uint8]], boards: Sequence[Board], config: BoardConfig, limit: float
+) -> _BoardSearch:
+    """Boards in the samples; where these show none, in all frames, until one does or `limit` seconds are spent."""
+    seen = {board.name: 0 for board in boards}
+
+    def looked_at(image: NDArray[np.uint8] | None) -> bool:
+        """Counts the boards in an image; False where it is not what the camera of the recording gives."""
+        if image is None or image.shape != (bag.camera.height, bag.camera.width):
+            return False
+        ellipses = detect_ellipses(image, bag.camera, config)
+        for name in {one.board for one in detect_boards(ellipses, boards, bag.camera)}:
             seen[name] += 1
-    return seen
+        return True
+
+    if not boards:
+        return _BoardSearch(seen, 0, False)
+    frames = sum(map(looked_at, samples))
+    if any(seen.values()):
+        return _BoardSearch(seen, frames, False)
+    started = time.thread_time()
+    frames, is_complete = 0, True
+    for frame in bag:
+        if any(seen.values()) or time.thread_time() > started + limit:
+            return _BoardSearch(seen, frames, False)
+        if not frame.fault:
+            is_used = looked_at(gray_image(frame, bag.image_type))
+            frames += is_used
+            is_complete = is_complete and is_used
+    return _BoardSearch(seen, frames, is_complete)

@@ -20,7 +20,7 @@ from pipeprog_bringup.playback.session import Session, State
 from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, seen_by, write_survey
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.recording.bag_writer import BagWriter
-from pipeprog_bringup.recording_check import faults_of
+from pipeprog_bringup.recording_check import first_look
 from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.nothing_found import why_nothing_was_found
@@ -81,18 +81,26 @@ class _Inputs:
     reference: SurveyMap | None = None
 
 
-def replay(request: Request, report: Callable[[State], None], modules: dict[str, str] = NODE_MODULES) -> Outcome:
+def replay(
+    request: Request,
+    report: Callable[[State], None],
+    tell: Callable[[str], None],
+    modules: dict[str, str] = NODE_MODULES,
+) -> Outcome:
     """Run the node graph on a recording and write its results.
 
+    `report` is called with where it stands, `tell` with sentences on the recording, before the nodes start.
     Raises InputError for what the user can mend and NodeFailure when a node dies, hangs or fails; either leaves no
     process and no file behind.
     """
     check_room(request.bag)
     inputs = _read(request)
     with OutputFolder(request.out, request.force) as folder, scratch_folder() as scratch:
-        faults = [faults_of(camera, inputs.board_file) for camera in inputs.bag.rig or (inputs.bag,)]
-        if all(faults):
-            raise InputError("; ".join(faults[0]))
+        found = first_look(inputs.bag, inputs.board_file, inputs.configs["sfm"].board, inputs.reference is not None)
+        for sentence in found.notes:
+            tell(sentence)
+        if found.faults:
+            raise InputError("; ".join(found.faults))
         parameters = _parameters(request, inputs.configs, folder.file("colmap"))
         parameters["frames"]["cameras"] = " ".join(camera.frame_id for camera in inputs.bag.rig)
         session = Session(inputs.bag, request.rate, report)

@@ -103,7 +103,7 @@ def replay(
         rig,
     )
     with replay_bars(quiet) as show, state_file(progress, show) as report:
-        outcome = run(request, report)
+        outcome = run(request, report, (lambda _: None) if quiet else note)
     if not quiet:
         for sentence in outcome.notes + outcome.losses:
             note(sentence)
