@@ -43,7 +43,12 @@ _MANY = 1 / 3  # of the frames looked at: of three neighbours, which must agree,
 # frames of the recordings in which a camera walks: 11 and more.
 _SAME = 1.0
 _THUMBNAIL = 80, 45  # px; averages 256 pixels at 720p, and their noise with them
-_RESULT_SHARE = 14  # bytes of results for each byte of a recording of JPEG images (docs/fleet.md)
+
+# Of the results, measured on four recordings of 720p in which a camera walks at 0.75 m/s, two metres from the wall.
+_POINTS_A_SECOND = 70_000  # of the cloud, one a voxel of 4 mm: 50 000 to 74 000; a slower walk shows less in a second
+_BYTES_A_POINT = 48 + 27 + 25  # cloud.las, cloud.ply, and compressed in out.mcap
+_KEYFRAMES_A_SECOND = 3.0  # 2.4 to 3.4; out.mcap has their images as they were recorded
+_BYTES_A_KEYFRAME = 450_000  # features in map.npz, features and points in colmap/
 
 
 @dataclass
@@ -122,7 +127,7 @@ def check(bag: Bag, board_file: BoardFile, size: int) -> Findings:
             "frames_searched": search.frames,
             "boards_seen": {board.name: search.seen.get(board.name, 0) for board in board_file.boards},
             "motion": sorted(bag.motion_topics.values()),
-            "result_mb": round(_RESULT_SHARE * size / 1e6),
+            "result_mb": _result_mb(size, len(stamps), seconds),
             "memory_mb": foreseen(size, None),
         },
         judged.faults,
@@ -264,3 +269,11 @@ def _search_boards(
             frames += is_used
             is_complete = is_complete and is_used
     return _BoardSearch(seen, frames, is_complete)
+
+
+def _result_mb(size: int, frames: int, seconds: float) -> int:
+    """The results to be expected [MB] of a recording of `size` bytes."""
+    points = _POINTS_A_SECOND * seconds
+    keyframes = min(_KEYFRAMES_A_SECOND * seconds, frames)
+    images = size * keyframes / max(frames, 1)
+    return round((_BYTES_A_POINT * points + _BYTES_A_KEYFRAME * keyframes + images) / 1e6)

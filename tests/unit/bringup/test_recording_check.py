@@ -78,6 +78,17 @@ def test_a_good_recording_is_described(tmp_path: Path, board_file: BoardFile) ->
     assert looked_at(bag_of(tmp_path, picture_of_the_board()), board_file) == Findings()
 
 
+@pytest.mark.parametrize(
+    ("size", "frames", "seconds", "written"),
+    [(9.6, 65, 12.8, 113.7), (15.4, 65, 12.8, 124.5), (20.9, 80, 15.8, 116.0), (28.8, 120, 39.7, 356.9)],
+    ids=["the demo", "the demo as a video", "a lab", "a field"],
+)
+def test_the_results_to_be_expected_are_near_those_that_were_written(
+    size: float, frames: int, seconds: float, written: float
+) -> None:
+    assert recording_check._result_mb(round(size * 1e6), frames, seconds) == pytest.approx(written, rel=0.3)
+
+
 def test_a_board_that_no_frame_shows_gives_no_result(tmp_path: Path, board_file: BoardFile) -> None:
     bag = bag_of(tmp_path, picture_of_a_wall(), 30)
     for found in (looked_at(bag, board_file), recording_check.check(bag, board_file, 1)):
