@@ -18,7 +18,7 @@ from pipeprog_detect.plan.materials import MATERIALS, read_material
 from pipeprog_detect.plan.plan_file import read_plan
 from pipeprog_detect.product.class_colors import Color, distinct_colors, read_color
 from pipeprog_detect.product.standard_sizes import find_size, nearest_name
-from pipeprog_detect.product.unit_check import WrittenSize, ask_about_units
+from pipeprog_detect.product.unit_check import WrittenSize, ask_about_length, ask_about_units
 from pipeprog_detect.types import Cylinder
 
 # Outer radius is toleranced to about half a percent of the diameter either way (EN 10220), and paint adds to it.
@@ -151,6 +151,8 @@ def load_boq(path: str | Path) -> BillOfQuantities:
     items = [_read_item(entry, number) for number, entry in enumerate(entries, 1)]
     ask_about_units([item.written for item in items if item.written is not None])
     for item in items:
+        if not item.segments:  # whose lengths are those of bodies in one unit
+            ask_about_length(item.where, item.planned.name, item.planned.planned_length)
         if item.planned.outer_radius < MIN_PIPE_RADIUS:
             raise InputError(
                 f"{item.where}: an outer radius of {item.planned.outer_radius:g} m is that of no pipe: "
@@ -254,7 +256,7 @@ def _read_item(given: Entry, number: int) -> _Item:
         given.where,
         PipeClass(name, radius, line.planned_length, _NO_COLOR, tolerance, wall, (line,)),
         read_color(where, entry["color"]) if "color" in entry else None,
-        None if key == "size" else WrittenSize(given.where, name, key, float(entry[key])),
+        None if key == "size" else WrittenSize(given.where, name, key, float(entry[key]), line.material == "insulated"),
         given.segments,
     )
 

@@ -22,6 +22,8 @@ _STEEL_NPS = {
     "2": 60.3, "2-1/2": 73.0, "3": 88.9, "3-1/2": 101.6, "4": 114.3, "5": 141.3, "6": 168.3, "8": 219.1, "10": 273.0,
     "12": 323.8, "14": 355.6, "16": 406.4, "18": 457.0, "20": 508.0, "22": 559.0, "24": 610.0,
 }  # fmt: skip
+# ASME B36.10 by DN, where it differs from EN 10220: a plan in DN may mean either.
+_ASME_DN = {"65": 73.0, "90": 101.6, "125": 141.3, "550": 559.0}
 _COPPER = (
     6, 8, 10, 12, 14, 15, 16, 18, 22, 25, 28, 35, 40, 42, 54, 64, 66.7, 70, 76.1, 80, 88.9, 108, 133, 159, 219, 267,
 )  # fmt: skip
@@ -60,11 +62,28 @@ def _table() -> dict[str, Size]:
 
 
 SIZES = _table()
+_NAMED_DN = re.compile(r"\bDN ?(\d+)\b", re.IGNORECASE)
+_NAMED_NPS = re.compile(r"\bNPS ?(\d+[ -]\d/\d|\d/\d|\d+)(?![\d/])", re.IGNORECASE)
 
 
 def find_size(text: str) -> Size | None:
     """The size that `text` names, such as 'DN50 steel', 'NPS 2-1/2 steel', '22 copper', 'DN110 PVC'; None if none."""
     return {_plain(name): size for name, size in SIZES.items()}.get(_plain(text))
+
+
+def named_dn(text: str) -> int | None:
+    """The first DN that a text names, 100 of 'heating DN100'; None where it names none."""
+    found = _NAMED_DN.search(text)
+    return int(found[1]) if found else None
+
+
+def named_diameters(text: str) -> list[float]:
+    """Outer diameters [m] of the nominal sizes that a text names, of each material; empty where it names none."""
+    dn = [found[1] for found in _NAMED_DN.finditer(text)]
+    nps = [found[1].replace(" ", "-") for found in _NAMED_NPS.finditer(text)]
+    names = [*(f"DN{one} {kind}" for one in dn for kind in ("steel", "PVC")), *(f"NPS {one} steel" for one in nps)]
+    diameters = [SIZES[name].outer_diameter for name in names if name in SIZES]
+    return diameters + [1e-3 * _ASME_DN[one] for one in dn if one in _ASME_DN]
 
 
 def nearest_name(text: str) -> str:

@@ -158,7 +158,7 @@ def test_a_wrong_table_is_reported_with_its_remedy(tmp_path: Path, text: str, to
 
 @pytest.mark.parametrize(
     ("lengths", "expected"),
-    [(["1.906", "8.60"], [1.906, 8.6]), (["1,906", "8,60"], [1.906, 8.6]), (["1.906,0", "8"], [1906.0, 8.0])],
+    [(["1.906", "8.60"], [1.906, 8.6]), (["1,906", "8,60"], [1.906, 8.6]), (["1.906,5", "8"], [1906.5, 8.0])],
 )
 def test_other_numbers_tell_what_a_mark_before_three_digits_is(
     tmp_path: Path, lengths: list[str], expected: list[float]
