@@ -52,7 +52,7 @@ def detect_file(
         pipes = detect(file.cloud, boq, config, (), report)
         timings = {"read": read - started, "detect": time.time() - read}
         product = product_of(pipes, boq, 0.0)
-        notes = why_nothing_was_found(product, file.cloud.points, boq)
+        notes = [*boq.notes, *why_nothing_was_found(product, file.cloud.points, boq)]
         if file.dropped:
             notes.append(f"{file.dropped} points of {cloud_path} are not finite or beyond 1e8 m and were left out")
         detection = Detection(product, len(file.cloud.points), file.dropped, notes)

@@ -60,7 +60,7 @@ class Request:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The result of a replay; `notes` and `losses` are sentences for the user on the recording."""
+    """The result of a replay; `notes` and `losses` are sentences for the user on plan and recording."""
 
     product: Product
     frames: int
@@ -120,6 +120,7 @@ def replay(
             keyframes=session.log.chosen,
             registered=status.keyframes_registered,
             notes=[
+                *inputs.boq.notes,
                 *inputs.bag.notes,
                 *filter(None, [status.calibration, status.message]),
                 *why_nothing_was_found(product, points, inputs.boq),

@@ -48,7 +48,9 @@ def check(
     board_file = load_board_file(board) if board else BoardFile()
     findings = look(recording, board_file, recording_size(bag))
     if boq:
-        findings.facts["classes"] = {one.name: round(1e3 * one.outer_radius, 2) for one in load_boq(boq).classes}
+        plan = load_boq(boq)
+        findings.facts["classes"] = {one.name: round(1e3 * one.outer_radius, 2) for one in plan.classes}
+        findings.notes.extend(plan.notes)
     if as_json:
         say_json({"facts": findings.facts, "faults": findings.faults, "notes": findings.notes})
     else:

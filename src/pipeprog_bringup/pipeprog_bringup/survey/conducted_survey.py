@@ -217,7 +217,7 @@ class ConductedSurvey:
             "keyframes": passage.log.chosen,
             "registered": status.keyframes_registered,
             "cancelled": self._client.is_cancel_requested,
-            "notes": [text for text in (status.calibration, status.message) if text],
+            "notes": [*site.boq.notes, *filter(None, (status.calibration, status.message))],
             "losses": passage.log.faults(),
             "seeds": {name: values["seed"] for name, values in settings.items() if "seed" in values},
             "timings_s": {"survey": time.monotonic() - self._started},

@@ -14,7 +14,13 @@ from pipeprog_camera.limits import MAX_DIGITS
 from pipeprog_camera.outside_text import shown
 from pipeprog_detect.plan.entry import Entry
 
-Cell = str | int | float | bool | datetime | date | None
+
+@dataclass(frozen=True)
+class FormulaWithoutValue:
+    """What a cell holds whose formula was never calculated."""
+
+
+Cell = str | int | float | bool | datetime | date | FormulaWithoutValue | None
 
 # Headings in English and German, without unit, case, underscores and hyphens, by the key that they stand for.
 _HEADINGS = {
@@ -35,6 +41,7 @@ _HEADINGS = {
     "start": ("start", "planned start", "beginn", "anfang"),
     "finish": ("finish", "planned finish", "end", "ende"),
 }
+_SIZES = ("outer_radius_mm", "outer_diameter_mm", "size")
 _KEY_OF = {heading: key for key, headings in _HEADINGS.items() for heading in headings}
 _METRES = {
     **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter"), 1e-3),
@@ -73,11 +80,24 @@ def table_entries(path: str, rows: Sequence[Sequence[Cell]]) -> list[Entry]:
             "columns"
         )
     columns = _columns(f"{path}, row {top + 1}", rows[top])
+    _require_size_and_length(f"{path}, row {top + 1}", rows[top], columns)
     body = [(number, row) for number, row in enumerate(rows[top + 1 :], top + 2) if any(_text(cell) for cell in row)]
     decimal = _decimal_mark(path, body, columns)
     return [
         Entry(f"{path}, row {number}", _values(f"{path}, row {number}", row, columns, decimal)) for number, row in body
     ]
+
+
+def _require_size_and_length(where: str, row: Sequence[Cell], columns: Sequence[_Column]) -> None:
+    """Raises InputError, naming the columns that are not understood, where none has the sizes, or none the lengths."""
+    keys = {column.key for column in columns}
+    used = {column.index for column in columns}
+    others = [shown(_text(cell)) for index, cell in enumerate(row) if _text(cell) and index not in used]
+    unknown = f": not understood: {', '.join(others)}" if others else ""
+    if not keys & set(_SIZES):
+        raise InputError(f"{where}: no column has the sizes{unknown}: write 'outer diameter [mm]' or 'size' above them")
+    if "planned_length_m" not in keys:
+        raise InputError(f"{where}: no column has the lengths{unknown}: write 'planned length [m]' above them")
 
 
 def heading_row(rows: Sequence[Sequence[Cell]]) -> int | None:
@@ -87,6 +107,15 @@ def heading_row(rows: Sequence[Sequence[Cell]]) -> int | None:
         if "name" in keys and len(keys) > 1:
             return number
     return None
+
+
+def is_bill(rows: Sequence[Sequence[Cell]]) -> bool:
+    """Whether a table has the headings of names, sizes and lengths, and a row below them."""
+    top = heading_row(rows)
+    if top is None or not any(_text(cell) for row in rows[top + 1 :] for cell in row):
+        return False
+    keys = {_key(_text(cell)) for cell in rows[top]}
+    return "planned_length_m" in keys and not keys.isdisjoint(_SIZES)
 
 
 def _columns(where: str, row: Sequence[Cell]) -> list[_Column]:
@@ -119,7 +148,10 @@ def _column(where: str, index: int, text: str) -> _Column:
     if unit not in _METRES:
         wanted = "mm" if key.endswith("_mm") else "m"
         better = f"{found['name'] if found else text} [{wanted}]"
-        raise InputError(f"{where}: the column {shown(text)} names no unit of length: write {shown(better)}")
+        raise InputError(
+            f"{where}: the column {shown(text)} names no unit of length: write {shown(better)} as its heading; "
+            "units in cells or in a column of their own are not read"
+        )
     return _Column(index, text, key, _METRES[unit] / _UNIT[key])
 
 
@@ -130,6 +162,11 @@ def _values(where: str, row: Sequence[Cell], columns: Sequence[_Column], decimal
         cell = row[column.index] if column.index < len(row) else None
         if not _text(cell):
             continue
+        if isinstance(cell, FormulaWithoutValue):
+            raise InputError(
+                f"{where}, column {shown(column.heading)}: the cell holds a formula without a value: open the workbook "
+                "in a spreadsheet program and save it"
+            )
         if column.factor:
             number = _number(cell, decimal)
             # Nine decimals of a millimetre: what a factor such as 25.4 leaves of binary fractions is cut off.
@@ -140,6 +177,11 @@ def _values(where: str, row: Sequence[Cell], columns: Sequence[_Column], decimal
             values[column.key] = int(cell)
         else:
             values[column.key] = cell
+    if not values.keys() & set(_SIZES):
+        name = f" of {shown(values['name'])}" if "name" in values else ""
+        raise InputError(
+            f"{where}: the row{name} has no size: delete it if it is a heading or a sum, or give it a size"
+        )
     return values
 
 

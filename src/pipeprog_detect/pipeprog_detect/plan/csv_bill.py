@@ -12,13 +12,13 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_BILL_COLUMNS, MAX_BILL_ROWS, MAX_TEXT, MAX_YAML
 from pipeprog_camera.text_file import read_text
 from pipeprog_detect.plan.bill_table import heading_row, table_entries
-from pipeprog_detect.plan.entry import Entry
+from pipeprog_detect.plan.entry import Plan
 
 _SEPARATORS = (";", "\t", ",")  # a decimal comma stands beside semicolons or tabs: these are looked for first
 
 
-def csv_entries(path: Path) -> list[Entry]:
-    """The entries of a CSV file; raises InputError where it is none or has no headings."""
+def read_csv_bill(path: Path) -> Plan:
+    """The bill in a CSV file; raises InputError where it is none or has no headings."""
     text = read_text(path, MAX_YAML)
     first, _, rest = text.partition("\n")
     if first.strip().lower() in ("sep=;", "sep=,", "sep=\t"):  # a line that Excel writes and takes
@@ -37,7 +37,7 @@ def csv_entries(path: Path) -> list[Entry]:
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV ({error}): write the file again") from None
     _refuse_parted_numbers(path, rows)
-    return table_entries(str(path), rows)
+    return Plan(table_entries(str(path), rows))
 
 
 def _refuse_parted_numbers(path: Path, rows: Sequence[Sequence[str]]) -> None:

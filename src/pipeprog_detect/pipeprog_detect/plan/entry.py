@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One class of a plan as every reader gives it, whatever the kind of the file."""
+"""A plan and its classes as every reader gives them, whatever the kind of the file."""
 
 from __future__ import annotations
 
@@ -37,3 +37,11 @@ class Entry:
     where: str
     values: object
     segments: tuple[Segment, ...] = ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a file of a plan holds: its entries, and sentences for the user on what of it counts, or does not."""
+
+    entries: list[Entry]
+    notes: tuple[str, ...] = ()

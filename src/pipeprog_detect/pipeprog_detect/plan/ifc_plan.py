@@ -23,7 +23,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_IFC, MAX_NAME, MAX_PIPES
 from pipeprog_camera.text_file import require_regular
-from pipeprog_detect.plan.entry import Entry, Segment
+from pipeprog_detect.plan.entry import Entry, Plan, Segment
 from pipeprog_detect.plan.materials import known_material
 
 _INSTALL = "plans in IFC need IfcOpenShell: `pip install ifcopenshell==0.9.0.post1` (or `make setup EXCHANGE=1`)"
@@ -45,7 +45,7 @@ class _Straight:
     material: str  # one that can be seen, or empty
 
 
-def ifc_entries(path: Path) -> list[Entry]:
+def read_ifc_plan(path: Path) -> Plan:
     """The pipes of an IFC file as entries of a bill, one for each size and material in each system, zone and activity.
 
     Raises InputError where it is none, holds no straight pipe with a place, or IfcOpenShell is not installed.
@@ -58,7 +58,7 @@ def ifc_entries(path: Path) -> list[Entry]:
     straights = _read_in_child(path)
     if not straights:
         raise InputError(f"{path} holds no straight pipe (IfcPipeSegment with a round body): export pipes as solids")
-    return _entries(str(path), straights)
+    return Plan(_entries(str(path), straights))
 
 
 def _read_in_child(path: Path) -> list[_Straight]:

@@ -9,11 +9,11 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.file_kinds import kind_of
 from pipeprog_camera.outside_text import nearest, shown
 from pipeprog_camera.yaml_file import line_of, read_yaml
-from pipeprog_detect.plan.entry import Entry
+from pipeprog_detect.plan.entry import Entry, Plan
 
 
-def yaml_entries(path: Path) -> list[Entry]:
-    """The entries of a BOQ.yaml; raises InputError where it is none."""
+def read_yaml_bill(path: Path) -> Plan:
+    """The bill in a BOQ.yaml; raises InputError where it is none."""
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no mapping: a bill of quantities begins with 'classes:'")
@@ -30,4 +30,4 @@ def yaml_entries(path: Path) -> list[Entry]:
             f"{path}{line_of(content, 'classes')}: classes is {shown(entries)}: "
             "list at least one class with name, radius and planned length"
         )
-    return [Entry(f"{path}{line_of(entries, number)}", entry) for number, entry in enumerate(entries)]
+    return Plan([Entry(f"{path}{line_of(entries, number)}", entry) for number, entry in enumerate(entries)])

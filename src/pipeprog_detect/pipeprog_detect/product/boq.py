@@ -99,10 +99,14 @@ class PlannedPipe:
 
 @dataclass(frozen=True)
 class BillOfQuantities:
-    """The planned classes, in the order of the file, and the planned pipes where the plan has their places."""
+    """The planned classes, in the order of the file, and the planned pipes where the plan has their places.
+
+    notes are sentences for the user: what of the file counts, or does not, and may be a mistake.
+    """
 
     classes: tuple[PipeClass, ...]
     pipes: tuple[PlannedPipe, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def radii(self) -> tuple[float, ...]:
@@ -145,10 +149,12 @@ def load_boq(path: str | Path) -> BillOfQuantities:
     Raises InputError, naming the file, the value and the remedy, for anything that is no bill of quantities.
     """
     path = Path(path)
-    entries = read_plan(path)
-    if len(entries) > MAX_CLASSES:
-        raise InputError(f"{path}: {len(entries)} classes: plan {MAX_CLASSES} at most, or split the bill by trades")
-    items = [_read_item(entry, number) for number, entry in enumerate(entries, 1)]
+    plan = read_plan(path)
+    if len(plan.entries) > MAX_CLASSES:
+        raise InputError(
+            f"{path}: {len(plan.entries)} classes: plan {MAX_CLASSES} at most, or split the bill by trades"
+        )
+    items = [_read_item(entry, number) for number, entry in enumerate(plan.entries, 1)]
     ask_about_units([item.written for item in items if item.written is not None])
     for item in items:
         if not item.segments:  # whose lengths are those of bodies in one unit
@@ -158,7 +164,7 @@ def load_boq(path: str | Path) -> BillOfQuantities:
                 f"{item.where}: an outer radius of {item.planned.outer_radius:g} m is that of no pipe: "
                 "write millimetres"
             )
-    return _grouped(items)
+    return replace(_grouped(items), notes=plan.notes)
 
 
 def _grouped(items: Sequence[_Item]) -> BillOfQuantities:

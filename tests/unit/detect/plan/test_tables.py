@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import xlsxwriter
 from openpyxl import Workbook
 
 from pipeprog_camera.errors import InputError
@@ -129,6 +130,17 @@ def test_lines_of_one_size_are_one_class_that_knows_them(planned: Any) -> None:
             "row 1: the column 'diameter' names no unit of length: write 'diameter [mm]'",
         ),
         ("name,diameter [kg],length [m]\nA,60.3,3\n", "names no unit of length"),
+        ("name,size,quantity,unit\nA,DN50 steel,3,m\n", "'quantity [m]' as its heading; units in cells or in a column"),
+        ("name,DN,length [m]\nA,50,3\n", "row 1: no column has the sizes: not understood: 'DN': write 'outer diam"),
+        (
+            "name,size,price,Länge\u00b2\nA,DN50 steel,3,4\n",
+            "no column has the lengths: not understood: 'price', 'Läng",
+        ),
+        ("name,size,length [m]\n1. Heating,,\nA,DN50 steel,3\n", "row 2: the row of '1. Heating' has no size: delete"),
+        (
+            "name,size,length [m]\nA,DN50 steel,3\n,,3\n",
+            "row 3: the row has no size: delete it if it is a heading or a",
+        ),
         ("name,diameter [mm],od [in],length [m]\nA,60.3,,3\n", "'diameter [mm]' and 'od [in]' say the same"),
         ("name,diameter [mm],length [m]\n", "names no class"),
         ("name,diameter [mm],length [m]\nA,60.3,\n", "row 2: class 'A' has no planned_length_m"),
@@ -175,6 +187,68 @@ def test_a_workbook_that_inflates_beyond_measure_is_refused_before_it_is_inflate
         archive.writestr("xl/media/image1.bin", bytes(MAX_XLSX_CONTENT))
     with pytest.raises(InputError, match="inflates to 64 MiB"):
         load_boq(path)
+
+
+BILL = [["Name", "Outer diameter [mm]", "Length [m]"], ["A", 60.3, 3], ["B", 76.1, 2]]
+
+
+def sheets(path: Path, content: dict[str, Sequence[Sequence[Any]]], hidden: Sequence[str] = ()) -> Path:
+    book = Workbook()
+    book.remove(book.active)
+    for name, rows in content.items():
+        sheet = book.create_sheet(name)
+        for row in rows:
+            sheet.append(list(row))
+        sheet.sheet_state = "hidden" if name in hidden else "visible"
+    book.save(path)
+    return path
+
+
+def test_hidden_sheets_are_not_read(tmp_path: Path) -> None:
+    old = [BILL[0], ["OLD", 48.3, 99]]
+    path = sheets(tmp_path / "boq.xlsx", {"2024": old, "Bill": BILL}, hidden=["2024"])
+    assert [planned.name for planned in load_boq(path).classes] == ["A", "B"]
+
+
+def test_two_bills_in_a_workbook_are_told(tmp_path: Path) -> None:
+    path = sheets(tmp_path / "boq.xlsx", {"Heating": BILL, "Water": [BILL[0], ["C", 33.7, 5]]})
+    with pytest.raises(InputError, match=r"the sheets 'Heating' and 'Water' are bills: put their rows into one sheet"):
+        load_boq(path)
+    others = {"Contacts": [["Name", "Area"], ["Kim", "north"]], "Template": [BILL[0]], "Bill": BILL}
+    assert [planned.name for planned in load_boq(sheets(path, others)).classes] == ["A", "B"]
+
+
+def test_hidden_rows_count_and_are_told(tmp_path: Path) -> None:
+    book = Workbook()
+    for row in [*BILL, ["C", 33.7, 5], []]:
+        book.active.append(row)
+    for number in (1, 3, 5):
+        book.active.row_dimensions[number].hidden = True
+    book.save(tmp_path / "boq.xlsx")
+    bill = load_boq(tmp_path / "boq.xlsx")
+    assert len(bill.classes) == 3
+    (note,) = bill.notes
+    assert note.endswith("sheet 'Sheet': hidden rows count, too: 3: delete those that are not planned")
+
+
+def test_a_formula_without_a_value_is_told(tmp_path: Path) -> None:
+    path = sheets(tmp_path / "boq.xlsx", {"Bill": [*BILL, ["C", 33.7, "=1.6*2"]]})
+    with pytest.raises(
+        InputError, match=r"row 4, column 'Length \[m\]': the cell holds a formula without a value: open"
+    ):
+        load_boq(path)
+    with xlsxwriter.Workbook(tmp_path / "values.xlsx") as book:
+        sheet = book.add_worksheet()
+        for number, row in enumerate(BILL):
+            sheet.write_row(number, 0, row)
+        sheet.write_formula(2, 2, "=1.6*2", None, 3.2)
+        for column in range(3):
+            sheet.write_formula(3, column, '=IF(D4="","",1)', None, "")
+    # Excel and LibreOffice tell the type of a formula that gives an empty text; XlsxWriter does not.
+    with zipfile.ZipFile(tmp_path / "values.xlsx") as written, zipfile.ZipFile(path, "w") as archive:
+        for part in written.namelist():
+            archive.writestr(part, written.read(part).replace(b'"><f>IF(', b'" t="str"><f>IF('))
+    assert [planned.planned_length for planned in load_boq(path).classes] == [3.0, 3.2]
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"name,size\n", b"\xd0\xcf\x11\xe0" * 200])
