@@ -102,9 +102,9 @@ def test_results_are_told_as_json_and_by_their_sizes(tmp_path: Path, capsys: pyt
     assert capsys.readouterr().out == f"2.0 MB in {tmp_path} (cloud.ply 2.0, run.json 0.0, pipes.json 0.0)\n"
 
 
-def pipe_of(radius: float, class_name: str | None) -> Pipe:
+def pipe_of(radius: float, class_name: str | None, probability: float = 0.0) -> Pipe:
     cylinder = Cylinder(np.zeros(3), np.array([0.0, 0.0, 1.0]), radius)
-    return Pipe("p01", cylinder, 1e-4, class_name, 1.0, 2.0, 1e-3, 100, class_name or "")
+    return Pipe("p01", cylinder, 1e-4, class_name, probability, 2.0, 1e-3, 100, class_name or "")
 
 
 @pytest.mark.parametrize(
@@ -127,4 +127,12 @@ def test_pipes_of_no_planned_class_are_told_with_both_radii() -> None:
     cloud = np.zeros((1, 3))
     (told,) = why_nothing_was_found(product_of([pipe_of(0.06, None)], BOQ), cloud, BOQ)
     assert "their outer radii are 60.0 mm, those of the bill 36.5 mm" in told
-    assert why_nothing_was_found(product_of([pipe_of(0.0365, "DN65")], BOQ), cloud, BOQ) == []
+    assert why_nothing_was_found(product_of([pipe_of(0.0365, "DN65", 1.0)], BOQ), cloud, BOQ) == []
+
+
+def test_pipes_between_two_planned_classes_are_told_as_such() -> None:
+    near = BillOfQuantities.of_radii({"a": 0.0575, "b": 0.0576})
+    pipes = [pipe_of(0.0575, None, 0.51), pipe_of(0.07, None)]
+    (told,) = why_nothing_was_found(product_of(pipes, near), np.zeros((1, 3)), near)
+    assert told.startswith("2 pipes were found, none surely of one class: 1 may be of either of two planned ones")
+    assert "the bill of this site" not in told

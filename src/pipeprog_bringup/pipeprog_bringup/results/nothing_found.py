@@ -22,6 +22,13 @@ def why_nothing_was_found(product: Product, points: NDArray[np.floating], boq: B
     planned = [1e3 * one.outer_radius for one in boq.classes]
     if product.pipes:
         found = [1e3 * pipe.cylinder.radius for pipe in product.pipes]
+        undecided = sum(pipe.class_probability > 0.0 for pipe in product.pipes)
+        if undecided:
+            return [
+                f"{len(found)} pipes were found, none surely of one class: {undecided} may be of either of two planned "
+                f"ones, whose outer radii or materials are too near to be told apart; found: {_range(found)}, planned: "
+                f"{_range(planned)}: make one class of the two, or film from nearer by"
+            ]
         return [
             f"{len(found)} pipes were found, none of a planned class: their outer radii are {_range(found)}, those of "
             f"the bill {_range(planned)}: is it the bill of this site, and the scale the right one?"

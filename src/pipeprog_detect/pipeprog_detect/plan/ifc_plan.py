@@ -22,8 +22,9 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_IFC, MAX_NAME, MAX_PIPES
+from pipeprog_camera.outside_text import shown
 from pipeprog_camera.text_file import require_regular
-from pipeprog_detect.plan.entry import Entry, Plan, Segment
+from pipeprog_detect.plan.entry import LEAST_RADIUS_STEP, Entry, Plan, Segment
 from pipeprog_detect.plan.materials import known_material
 
 _INSTALL = "plans in IFC need IfcOpenShell: `pip install ifcopenshell==0.9.0.post1` (or `make setup EXCHANGE=1`)"
@@ -31,6 +32,12 @@ _NESTED = 8  # mapped items within each other; exporters write one
 _STEP = 1e-5  # m to which outer radii are rounded: sizes of one class differ by less in files of single precision
 # Of a mesh, the principal axis is that of the pipe where it is this much longer than wide.
 _SLENDER = 2.0
+# m; outer diameters beyond are those of no pipe (capillary tubes have 3.4 mm, penstocks some metres), but those of one
+# whose numbers are in another unit than the file names: a DN15 of 21.3 m, a DN200 of 0.2 mm.
+_THINNEST, _THICKEST = 3e-3, 10.0
+_SAME_PLACE = 1e-3  # m; ends of a body and its copy are nearer, those of two pipes are a diameter apart
+_NAMED = 3  # pipes that a note names; the others are counted
+_END = b"END-ISO-10303-21;"
 
 
 @dataclass(frozen=True)
@@ -48,21 +55,92 @@ class _Straight:
 def read_ifc_plan(path: Path) -> Plan:
     """The pipes of an IFC file as entries of a bill, one for each size and material in each system, zone and activity.
 
-    Raises InputError where it is none, holds no straight pipe with a place, or IfcOpenShell is not installed.
+    Notes tell the pipes that no cylinder could be made of, and those that lie in one place. Raises InputError where the
+    file is none or cut off, holds no straight pipe with a place, or has another unit than it names, and where
+    IfcOpenShell is not installed.
     """
     require_regular(path)
     if path.stat().st_size > MAX_IFC:
         raise InputError(f"{path} is larger than {MAX_IFC >> 20} MiB: export the pipes' discipline alone")
     if find_spec("ifcopenshell") is None:
         raise InputError(f"{path}: {_INSTALL}")
-    straights = _read_in_child(path)
+    straights, left_out = _read_in_child(path)
+    if _END not in path.read_bytes()[-4096:]:
+        raise InputError(f"{path} cannot be read as IFC (it is cut off: {_END.decode()} is missing): export it again")
     if not straights:
         raise InputError(f"{path} holds no straight pipe (IfcPipeSegment with a round body): export pipes as solids")
-    return Plan(_entries(str(path), straights))
+    for one in straights:
+        if not _THINNEST <= 2.0 * one.radius <= _THICKEST:
+            raise InputError(
+                f"{path}: pipe {shown(_name(one))} is {2e3 * one.radius:g} mm across: the unit of length that the file "
+                "names is not that of its numbers: export it again, with metres as metres"
+            )
+    notes = [*_of_left_out(left_out, len(straights)), *_of_doubled(straights)]
+    return Plan(_entries(str(path), _with_sizes(straights)), tuple(f"{path}: {note}" for note in notes))
 
 
-def _read_in_child(path: Path) -> list[_Straight]:
-    """The pipes of a file, read in a process of its own, which damage to the file may end."""
+def _of_left_out(names: Sequence[str], straights: int) -> list[str]:
+    """A note on the pipes without a straight round body."""
+    if not names:
+        return []
+    return [
+        f"pipes without a straight round body count in no class, {len(names)} of {straights + len(names)}: "
+        f"{_listed(names)}: export them as solids"
+    ]
+
+
+def _of_doubled(straights: Sequence[_Straight]) -> list[str]:
+    """A note on the pipes of one size that lie in one place, so that their metres count twice."""
+    from scipy.spatial import cKDTree  # a tenth of a second that only plans in IFC need
+
+    places = np.array([[*one.segment.start, *one.segment.end, one.radius] for one in straights])
+    if len(places) < 2:
+        return []
+    tree = cKDTree(places)
+    alike = tree.query(places, k=2)[0][:, 1]
+    turned = tree.query(places[:, [3, 4, 5, 0, 1, 2, 6]])[0]
+    distances = np.minimum(alike, turned)
+    doubled = [_name(one) for one, away in zip(straights, distances, strict=True) if away < _SAME_PLACE]
+    if not doubled:
+        return []
+    return [
+        f"{len(doubled)} pipes share their places with others of their size, and the metres of each are planned: "
+        f"{_listed(doubled)}: delete copies in the plan"
+    ]
+
+
+def _name(one: _Straight) -> str:
+    return one.segment.name or one.segment.id
+
+
+def _listed(names: Sequence[str]) -> str:
+    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(map(shown, names[:_NAMED])) + rest
+
+
+def _with_sizes(straights: Sequence[_Straight]) -> list[_Straight]:
+    """The pipes, those whose radii differ by what a survey does not tell with the radius that most metres of them have.
+
+    Exporters round radii, and a class of its own for each would get no pipe, since each pipe may be of either.
+    """
+    metres: dict[float, float] = {}
+    for one in straights:
+        metres[one.radius] = metres.get(one.radius, 0.0) + float(np.linalg.norm(one.segment.end - one.segment.start))
+    groups: list[list[float]] = []
+    for radius in sorted(metres):
+        if groups and round(radius - groups[-1][-1], 9) < LEAST_RADIUS_STEP:
+            groups[-1].append(radius)
+        else:
+            groups.append([radius])
+    size = {radius: max(group, key=lambda one: metres[one]) for group in groups for radius in group}
+    return [replace(one, radius=size[one.radius]) for one in straights]
+
+
+def _read_in_child(path: Path) -> tuple[list[_Straight], list[str]]:
+    """The pipes of a file, and the names of those that no cylinder could be made of.
+
+    They are read in a process of its own, which damage to the file may end.
+    """
     child = subprocess.run(
         [sys.executable, "-c", f"from {__name__} import _serve; _serve()", str(path)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -72,26 +150,29 @@ def _read_in_child(path: Path) -> list[_Straight]:
     )
     try:
         answer = json.loads(child.stdout.splitlines()[-1])
-        problem, rows = answer["problem"], answer["pipes"]
+        problem, rows, left_out = answer["problem"], answer["pipes"], answer["left_out"]
     except (IndexError, KeyError, TypeError, ValueError):
-        problem, rows = f"cannot be read as IFC (its reader ended with code {child.returncode}): export it again", []
+        problem = f"cannot be read as IFC (its reader ended with code {child.returncode}): export it again"
+        rows, left_out = [], []
     if problem:
         raise InputError(f"{path} {problem}")
-    return [
+    straights = [
         _Straight(
             Segment(identity, name, np.array(start), np.array(end)), radius, kind, tuple(place), tuple(days), look
         )
         for identity, name, start, end, radius, kind, place, days, look in rows
     ]
+    return straights, left_out
 
 
 def _serve() -> None:
-    """The child: writes what is wrong, or the pipes, as a line of JSON."""
+    """The child: writes what is wrong, or the pipes and the names of those left out, as a line of JSON."""
     import ifcopenshell
 
-    problem, pipes = "", []
+    problem, pipes, left_out = "", [], []
     try:
-        for one in _straights(ifcopenshell.open(sys.argv[1])):
+        straights, left_out = _straights(ifcopenshell.open(sys.argv[1]))
+        for one in straights:
             ends = one.segment.start.tolist(), one.segment.end.tolist()
             own = one.radius, one.type_name, one.place, one.days, one.material
             pipes.append([one.segment.id, one.segment.name, *ends, *own])
@@ -103,7 +184,8 @@ def _serve() -> None:
     except Exception as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
         problem = f"cannot be read as IFC ({reason}): export it again as IFC4"
-    sys.stdout.write("\n" + json.dumps({"problem": problem, "pipes": [] if problem else pipes}) + "\n")
+    answer = {"problem": problem, "pipes": [] if problem else pipes, "left_out": left_out}
+    sys.stdout.write("\n" + json.dumps(answer) + "\n")
 
 
 def _entries(path: str, straights: Sequence[_Straight]) -> list[Entry]:
@@ -144,27 +226,27 @@ def _group_name(group: Sequence[_Straight], kinds: dict[str, set[tuple[float, st
     return text if len(text) <= MAX_NAME // 2 else " ".join([names[0][: MAX_NAME // 4], *words]).strip()
 
 
-def _straights(model: Any) -> list[_Straight]:
+def _straights(model: Any) -> tuple[list[_Straight], list[str]]:
+    """The straight pipes of a model, and the names of its other ones."""
     from ifcopenshell.util.unit import calculate_unit_scale
 
     scale = float(calculate_unit_scale(model))  # metres in a unit of the file
     elements = model.by_type("IfcFlowSegment" if model.schema == "IFC2X3" else "IfcPipeSegment")
     if len(elements) > MAX_PIPES:
         raise InputError(f"{len(elements)} pipes: plan {MAX_PIPES} at most, or export it storey by storey")
-    found = []
+    found, left_out = [], []
     for element in elements:
-        place = _place(element, scale)
-        if place is None:
-            continue
-        start, end, radius = place
+        start, end, radius = _place(element, scale) or (np.zeros(3), np.zeros(3), 0.0)
         if not (np.abs([*start, *end, radius]) <= MAX_COORDINATE).all():
             raise InputError(f"pipe {element.GlobalId} lies beyond all coordinates: export the plan again")
+        name = _text(element.Name)
         if np.linalg.norm(end - start) > 0.0 < radius:
-            segment = Segment(str(element.GlobalId), _text(element.Name), start, end)
             rounded = round(round(radius / _STEP) * _STEP, 9)
             own = _type_name(element), _belongs_to(element), _days(element), _material(element)
-            found.append(_Straight(segment, rounded, *own))
-    return found
+            found.append(_Straight(Segment(str(element.GlobalId), name, start, end), rounded, *own))
+        else:
+            left_out.append(name or str(element.GlobalId))
+    return found, left_out
 
 
 def _place(element: Any, scale: float) -> tuple[FloatArray, FloatArray, float] | None:

@@ -8,12 +8,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
+from itertools import combinations
 from pathlib import Path
 
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CLASSES, MAX_NAME, MAX_PIPE_LENGTH, MAX_PIPE_RADIUS, MIN_PIPE_RADIUS
 from pipeprog_camera.outside_text import name_of, nearest, shown
-from pipeprog_detect.plan.entry import Entry, Segment
+from pipeprog_detect.plan.entry import LEAST_RADIUS_STEP, Entry, Segment
 from pipeprog_detect.plan.materials import MATERIALS, read_material
 from pipeprog_detect.plan.plan_file import read_plan
 from pipeprog_detect.product.class_colors import Color, distinct_colors, read_color
@@ -155,10 +156,10 @@ def load_boq(path: str | Path) -> BillOfQuantities:
             f"{path}: {len(plan.entries)} classes: plan {MAX_CLASSES} at most, or split the bill by trades"
         )
     items = [_read_item(entry, number) for number, entry in enumerate(plan.entries, 1)]
-    ask_about_units([item.written for item in items if item.written is not None])
-    for item in items:
-        if not item.segments:  # whose lengths are those of bodies in one unit
-            ask_about_length(item.where, item.planned.name, item.planned.planned_length)
+    written = [item for item in items if not item.segments]  # the others are those of bodies in one unit
+    ask_about_units([item.written for item in written if item.written is not None])
+    for item in written:
+        ask_about_length(item.where, item.planned.name, item.planned.planned_length)
         if item.planned.outer_radius < MIN_PIPE_RADIUS:
             raise InputError(
                 f"{item.where}: an outer radius of {item.planned.outer_radius:g} m is that of no pipe: "
@@ -178,6 +179,8 @@ def _grouped(items: Sequence[_Item]) -> BillOfQuantities:
         else:
             group.append(item)
     classes = [_joined([item.planned for item in group]) for group in groups]
+    for (one, first), (other, _) in combinations(zip(classes, groups, strict=True), 2):
+        _refuse_near(first[0].where, one, other)
     colors = [next((item.color for item in group if item.color is not None), None) for group in groups]
     pipes = [
         PlannedPipe(one.id, one.name, Cylinder(one.start, one.end, item.planned.outer_radius), planned.name, line)
@@ -216,6 +219,19 @@ def _refuse_double(item: _Item, group: Sequence[_Item], other_sizes: Sequence[Se
             f"{1e3 * item.planned.outer_radius:g} mm and cannot be told apart: merge them, or give each its system, "
             f"zone or activity, or a material that can be seen ({', '.join(MATERIALS[:4])}, ...)"
         )
+
+
+def _refuse_near(where: str, one: PipeClass, other: PipeClass) -> None:
+    """Raises InputError where the radii of two classes are too near, and no materials tell these apart."""
+    by_look = one.material and other.material and one.material != other.material
+    if by_look or round(abs(one.outer_radius - other.outer_radius), 9) >= LEAST_RADIUS_STEP:
+        return
+    radii = f"{1e3 * one.outer_radius:g} and {1e3 * other.outer_radius:g} mm"
+    raise InputError(
+        f"{where}: classes {shown(one.name)} and {shown(other.name)} have outer radii of {radii}, and a survey tells "
+        f"steps of {1e3 * LEAST_RADIUS_STEP:g} mm at best: write one size for both, or give each a material that can "
+        f"be seen ({', '.join(MATERIALS[:4])}, ...)"
+    )
 
 
 def _same_place(one: BillLine, other: BillLine) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -84,6 +85,70 @@ def test_what_is_no_plan_is_told_so(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.ifc"
     path.write_text(text)
     with pytest.raises(InputError, match=r"plan\.ifc (cannot be read as IFC|holds no straight pipe)"):
+        load_boq(path)
+
+
+@needs_ifc
+def test_pipes_that_are_left_out_are_told(tmp_path: Path) -> None:
+    import ifcopenshell
+
+    path = tmp_path / "plan.ifc"
+    write_plan_ifc(path, PIPES)
+    model = ifcopenshell.open(str(path))
+    model.by_type("IfcPipeSegment")[1].Representation = None
+    model.write(str(path))
+    plan = load_boq(path)
+    assert [one.planned_length for one in plan.classes] == pytest.approx([2.5, PIPES[2][2].length])
+    assert plan.notes == (
+        f"{path}: pipes without a straight round body count in no class, 1 of 3: 'b': export them as solids",
+    )
+
+
+@needs_ifc
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_two_pipes_in_one_place_are_told(tmp_path: Path, is_turned: bool) -> None:
+    place = PIPES[0][2]
+    copy = Cylinder(place.end, place.start, place.radius) if is_turned else place
+    write_plan_ifc(tmp_path / "plan.ifc", [*PIPES, ("a2", "DN100", copy)])
+    plan = load_boq(tmp_path / "plan.ifc")
+    assert plan.classes[0].planned_length == pytest.approx(7.5)
+    (note,) = plan.notes
+    assert "2 pipes share their places with others of their size" in note
+    assert "'a', 'a2': delete copies in the plan" in note
+
+
+@needs_ifc
+def test_sizes_that_differ_by_rounding_are_one(tmp_path: Path) -> None:
+    rounded = [
+        Cylinder(one.start, one.end, radius) for (_, _, one), radius in zip(PIPES, (57.5, 57.52, 57.8), strict=True)
+    ]
+    pipes = [
+        (name, "DN100", replace(one, radius=1e-3 * one.radius))
+        for (name, _, _), one in zip(PIPES, rounded, strict=True)
+    ]
+    write_plan_ifc(tmp_path / "plan.ifc", pipes)
+    plan = load_boq(tmp_path / "plan.ifc")
+    assert [(one.name, 1e3 * one.outer_radius, one.planned_length) for one in plan.classes] == [
+        ("DN100", pytest.approx(57.5), pytest.approx(5.0 + PIPES[2][2].length))
+    ]
+
+
+@needs_ifc
+@pytest.mark.parametrize(("factor", "told"), [(1e-3, "is 0.12 mm across"), (1e3, "is 114300 mm across")])
+def test_numbers_in_another_unit_than_the_file_names_are_told(tmp_path: Path, factor: float, told: str) -> None:
+    pipes = [(name, kind, Cylinder(factor * p.start, factor * p.end, factor * p.radius)) for name, kind, p in PIPES]
+    write_plan_ifc(tmp_path / "plan.ifc", pipes)
+    with pytest.raises(InputError, match=f"pipe 'a' {told}: the unit of length that the file names is not that of its"):
+        load_boq(tmp_path / "plan.ifc")
+
+
+@needs_ifc
+def test_a_file_that_is_cut_off_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "plan.ifc"
+    write_plan_ifc(path, PIPES)
+    text = path.read_text()
+    path.write_text(text[: text.rindex("IFCPIPESEGMENT(")])
+    with pytest.raises(InputError, match="is cut off: END-ISO-10303-21; is missing"):
         load_boq(path)
 
 

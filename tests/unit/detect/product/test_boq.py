@@ -163,3 +163,16 @@ def test_a_wall_is_for_cameras_inside(tmp_path: Path) -> None:
 def test_a_missing_boq_is_reported_with_its_path(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no such file: .*none\.yaml"):
         load_boq(tmp_path / "none.yaml")
+
+
+def test_radii_that_no_survey_tells_apart_are_refused(tmp_path: Path) -> None:
+    rows = """classes:
+  - {{name: a, outer_radius_mm: 57.5, planned_length_m: 3, system: heating{0}}}
+  - {{name: b, outer_radius_mm: {1}, planned_length_m: 2, system: water{2}}}
+"""
+    with pytest.raises(
+        InputError, match=r"line 2: classes 'a' and 'b' have outer radii of 57\.5 and 57\.52 mm, .*: write"
+    ):
+        load_boq(written(tmp_path, rows.format("", 57.52, "")))
+    for apart in (("", 57.8, ""), (", material: copper", 57.52, ", material: steel")):
+        assert len(load_boq(written(tmp_path, rows.format(*apart))).classes) == 2
