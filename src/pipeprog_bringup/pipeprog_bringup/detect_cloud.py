@@ -13,6 +13,7 @@ from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import read_cloud
 from pipeprog_bringup.results.nothing_found import why_nothing_was_found
 from pipeprog_bringup.results.plan_file import write_plan
+from pipeprog_bringup.results.plan_place import why_no_place_is_planned
 from pipeprog_bringup.results.setting_overrides import effective
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -21,6 +22,7 @@ from pipeprog_detect.product.product import Product, product_of
 
 # The file's own metres are the scale: none was measured, so nothing is added to the pipes' sigmas.
 SCALE = result_files.Scale("cloud", 0.0)
+_ONE_SYSTEM = "export cloud and plan in the same coordinates"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +55,7 @@ def detect_file(
         timings = {"read": read - started, "detect": time.time() - read}
         product = product_of(pipes, boq, 0.0)
         notes = [*boq.notes, *why_nothing_was_found(product, file.cloud.points, boq)]
+        notes += why_no_place_is_planned(boq.pipes, file.cloud.points, _ONE_SYSTEM)
         if file.dropped:
             notes.append(f"{file.dropped} points of {cloud_path} are not finite or beyond 1e8 m and were left out")
         detection = Detection(product, len(file.cloud.points), file.dropped, notes)

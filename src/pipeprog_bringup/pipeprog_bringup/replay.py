@@ -25,6 +25,7 @@ from pipeprog_bringup.results import result_files
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.nothing_found import why_nothing_was_found
 from pipeprog_bringup.results.plan_file import write_plan
+from pipeprog_bringup.results.plan_place import why_no_place_is_planned
 from pipeprog_bringup.results.setting_overrides import as_parameters, effective
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
@@ -35,6 +36,7 @@ from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 
 FOCAL_SIGMA = "sfm.calibration.focal_sigma"
+_GIVE_POINTS = "is it in site coordinates? `pipeprog export --points` compares them there"
 GUESSED_DISTORTION = 0.1  # standard deviation of k1 where no distortion is known: lenses of phones have up to 0.2
 
 
@@ -124,6 +126,7 @@ def replay(
                 *inputs.bag.notes,
                 *filter(None, [status.calibration, status.message]),
                 *why_nothing_was_found(product, points, inputs.boq),
+                *why_no_place_is_planned(inputs.boq.pipes, points, _GIVE_POINTS),
             ],
             losses=inputs.bag.losses + session.log.faults(),
         )

@@ -7,13 +7,16 @@ import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeprog_bringup.results.cloud_io import write_ply
+from pipeprog_detect.types import Cylinder
 from tests.unit.bringup.recordings import write_bag
+from tests.unit.detect.plan.ifc_site import write_plan_ifc
 
 BOARDS = """boards:
   - {name: A, circle_radius_mm: 30, centres_mm: [[-130, 80], [130, 80], [40, 10], [-130, -80], [130, -80]]}
@@ -102,6 +105,18 @@ def test_detect_writes_its_results_and_says_where(folder: Path) -> None:
     assert [pipe["class"] for pipe in content["pipes"]] == ["DN65"]
     assert "DN65" in result.stdout
     assert "pipes.json" in result.stdout
+
+
+@pytest.mark.skipif(find_spec("ifcopenshell") is None, reason="IfcOpenShell is not installed: make setup EXCHANGE=1")
+def test_detect_tells_what_the_plan_leaves_out_and_that_it_lies_elsewhere(folder: Path) -> None:
+    place = Cylinder(np.array([500.0, 0.0, 0.0]), np.array([500.0, 0.0, 1.5]), 0.0365)
+    write_plan_ifc(folder / "plan.ifc", [("a", "DN65", place), ("b", "DN65", place)])
+    result = pipeprog("detect", folder / "cloud.ply", "--boq", folder / "plan.ifc", "--out", folder / "out")
+    assert result.returncode == 0, result.stderr
+    notes = json.loads((folder / "out" / "run.json").read_text())["notes"]
+    assert [note for note in notes if "2 pipes share their places" in note]
+    assert [note for note in notes if "the plan lies 500 m away from the survey" in note]
+    assert "Note: the plan lies 500 m away" in result.stderr
 
 
 def test_board_writes_a_page_for_each_board(folder: Path) -> None:

@@ -52,7 +52,7 @@ def export(
     `pipeprog export out/monday --to xlsx --to csv`
     """
     from pipeprog_bringup.export.formats import export as write
-    from pipeprog_bringup.export.formats import site_alignment
+    from pipeprog_bringup.export.formats import plan_notes, site_alignment
 
     alignment, told = (None, []) if points is None else site_alignment(folder, points, board)
     for sentence in told:
@@ -61,3 +61,5 @@ def export(
         note(alignment.warning)
     for path in write(folder, to, out or folder / "export", force, alignment):
         say(f"Written: {path}")
+    for sentence in plan_notes(folder, alignment):
+        note(sentence)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from pipeprog_bringup.export.bcf import write_bcf
 from pipeprog_bringup.export.colmap import write_colmap
 from pipeprog_bringup.export.control_points import Alignment, align, load_control_points
@@ -19,6 +21,7 @@ from pipeprog_bringup.export.point_places import points_in_map
 from pipeprog_bringup.export.survey import Site, Survey
 from pipeprog_bringup.export.xlsx import write_xlsx
 from pipeprog_bringup.results.atomic_output import OutputFolder, output_file
+from pipeprog_bringup.results.plan_place import why_no_place_is_planned
 from pipeprog_bringup.results.results_reader import read_results
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import nearest, shown
@@ -59,6 +62,23 @@ def site_alignment(folder: Path, points: Path, board: Path | None) -> tuple[Alig
         for point, residual in zip(file.points, found.residuals, strict=True)
     ]
     return found, [*told, f"a metre of the map is {found.scale:.5f} m between the control points"]
+
+
+def plan_notes(folder: Path, alignment: Alignment | None = None) -> list[str]:
+    """A sentence where the plan of a results folder lies elsewhere, in the coordinates that it is exported in.
+
+    Raises InputError where the folder holds no results.
+    """
+    survey = Survey(read_results(folder), Site() if alignment is None else alignment.site)
+    places = [survey.results.map_from_camera[:, :3, 3]]
+    places += [np.array([cylinder.start, cylinder.end]) for cylinder in survey.results.cylinders]
+    remedy = (
+        "is it in site coordinates? Give control points with --points"
+        if alignment is None
+        else "are the control points in its coordinates?"
+    )
+    planned = [state.planned for state in survey.planned]
+    return why_no_place_is_planned(planned, survey.site.place(np.concatenate(places)), remedy)
 
 
 def export(

@@ -169,7 +169,9 @@ def _serve() -> None:
     """The child: writes what is wrong, or the pipes and the names of those left out, as a line of JSON."""
     import ifcopenshell
 
-    problem, pipes, left_out = "", [], []
+    problem = ""
+    pipes: list[list[Any]] = []
+    left_out: list[str] = []
     try:
         straights, left_out = _straights(ifcopenshell.open(sys.argv[1]))
         for one in straights:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from openpyxl import load_workbook
 
-from pipeprog_bringup.export.formats import export
+from pipeprog_bringup.export.control_points import Alignment
+from pipeprog_bringup.export.formats import export, plan_notes
+from pipeprog_bringup.export.survey import Site
 from pipeprog_bringup.results.plan_file import read_plan, write_plan
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import PlannedPipe
@@ -45,6 +47,29 @@ def test_the_workbook_tells_what_is_installed_where_planned(folder: Path, tmp_pa
     assert progress["  heating DN40"] == 0
     tasks = dict(book["TASK"].iter_rows(min_row=3, values_only=True))
     assert tasks == {"A1010": pytest.approx(100 * 1.906 / 3.2), "A1020": 0, "A1030": pytest.approx(100 * 1.25 / 1.5)}
+
+
+def test_a_plan_in_other_coordinates_is_told(folder: Path) -> None:
+    site = np.array([691234.0, 5334567.0, 512.0])
+    there = PIPES[0].cylinder.shifted(site)
+    write_plan(folder / "plan.json", [PlannedPipe("guid-1", "riser", there, "=DN65", 0)])
+    (told,) = plan_notes(folder)
+    assert "the plan lies 5379 km away from the survey" in told
+    assert told.endswith("is it in site coordinates? Give control points with --points")
+    site_from_map = np.eye(4)
+    site_from_map[:3, 3] = site
+    assert plan_notes(folder, Alignment(Site(site_from_map), np.zeros(3), 1.0)) == []
+    site_from_map[0, 3] += 300.0
+    (told,) = plan_notes(folder, Alignment(Site(site_from_map), np.zeros(3), 1.0))
+    assert "the plan lies 299 m away" in told
+    assert told.endswith("are the control points in its coordinates?")
+
+
+def test_a_plan_of_the_next_room_is_not_told_of(folder: Path) -> None:
+    assert plan_notes(folder) == [], "without a plan"
+    there = PIPES[0].cylinder.shifted(np.array([6.0, -6.0, 3.0]))
+    write_plan(folder / "plan.json", [PlannedPipe("guid-1", "riser", there, "=DN65", 0)])
+    assert plan_notes(folder) == []
 
 
 def test_a_plan_is_read_as_it_was_written(tmp_path: Path) -> None:

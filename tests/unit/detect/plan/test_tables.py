@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -189,10 +189,10 @@ def test_a_workbook_that_inflates_beyond_measure_is_refused_before_it_is_inflate
         load_boq(path)
 
 
-BILL = [["Name", "Outer diameter [mm]", "Length [m]"], ["A", 60.3, 3], ["B", 76.1, 2]]
+BILL: list[list[Any]] = [["Name", "Outer diameter [mm]", "Length [m]"], ["A", 60.3, 3], ["B", 76.1, 2]]
 
 
-def sheets(path: Path, content: dict[str, Sequence[Sequence[Any]]], hidden: Sequence[str] = ()) -> Path:
+def sheets(path: Path, content: Mapping[str, Sequence[Sequence[Any]]], hidden: Sequence[str] = ()) -> Path:
     book = Workbook()
     book.remove(book.active)
     for name, rows in content.items():
