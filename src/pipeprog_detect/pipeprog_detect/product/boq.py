@@ -223,8 +223,9 @@ def _refuse_double(item: _Item, group: Sequence[_Item], other_sizes: Sequence[Se
 
 def _refuse_near(where: str, one: PipeClass, other: PipeClass) -> None:
     """Raises InputError where the radii of two classes are too near, and no materials tell these apart."""
-    by_look = one.material and other.material and one.material != other.material
-    if by_look or round(abs(one.outer_radius - other.outer_radius), 9) >= LEAST_RADIUS_STEP:
+    if round(abs(one.outer_radius - other.outer_radius), 9) >= LEAST_RADIUS_STEP:
+        return
+    if one.material and other.material and one.material != other.material:
         return
     radii = f"{1e3 * one.outer_radius:g} and {1e3 * other.outer_radius:g} mm"
     raise InputError(
