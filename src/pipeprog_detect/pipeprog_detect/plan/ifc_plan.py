@@ -32,8 +32,8 @@ _NESTED = 8  # mapped items within each other; exporters write one
 _STEP = 1e-5  # m to which outer radii are rounded: sizes of one class differ by less in files of single precision
 # Of a mesh, the principal axis is that of the pipe where it is this much longer than wide.
 _SLENDER = 2.0
-# m; outer diameters beyond are those of no pipe (capillary tubes have 3.4 mm, penstocks some metres), but those of one
-# whose numbers are in another unit than the file names: a DN15 of 21.3 m, a DN200 of 0.2 mm.
+# m; where all outer diameters are smaller (capillary tubes have 3.4 mm) or all larger (penstocks have some metres), the
+# numbers are in another unit than the file names: a DN200 of 0.2 mm, a DN15 of 21.3 m.
 _THINNEST, _THICKEST = 3e-3, 10.0
 _SAME_PLACE = 1e-3  # m; ends of a body and its copy are nearer, those of two pipes are a diameter apart
 _NAMED = 3  # pipes that a note names; the others are counted
@@ -69,12 +69,12 @@ def read_ifc_plan(path: Path) -> Plan:
         raise InputError(f"{path} cannot be read as IFC (it is cut off: {_END.decode()} is missing): export it again")
     if not straights:
         raise InputError(f"{path} holds no straight pipe (IfcPipeSegment with a round body): export pipes as solids")
-    for one in straights:
-        if not _THINNEST <= 2.0 * one.radius <= _THICKEST:
-            raise InputError(
-                f"{path}: pipe {shown(_name(one))} is {2e3 * one.radius:g} mm across: the unit of length that the file "
-                "names is not that of its numbers: export it again, with metres as metres"
-            )
+    diameters = [2.0 * one.radius for one in straights]
+    if max(diameters) < _THINNEST or min(diameters) > _THICKEST:
+        raise InputError(
+            f"{path}: its pipes are {1e3 * min(diameters):g} to {1e3 * max(diameters):g} mm across: the unit of length "
+            "that the file names is not that of its numbers: export it again, with metres as metres"
+        )
     notes = [*_of_left_out(left_out, len(straights)), *_of_doubled(straights)]
     return Plan(_entries(str(path), _with_sizes(straights)), tuple(f"{path}: {note}" for note in notes))
 

@@ -160,6 +160,7 @@ def load_boq(path: str | Path) -> BillOfQuantities:
     ask_about_units([item.written for item in written if item.written is not None])
     for item in written:
         ask_about_length(item.where, item.planned.name, item.planned.planned_length)
+    for item in items:
         if item.planned.outer_radius < MIN_PIPE_RADIUS:
             raise InputError(
                 f"{item.where}: an outer radius of {item.planned.outer_radius:g} m is that of no pipe: "

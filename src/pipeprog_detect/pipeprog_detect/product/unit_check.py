@@ -111,7 +111,11 @@ def _ask_by_name(size: WrittenSize) -> None:
     if off:
         raise InputError(_question(size, min(off, key=lambda reading: off[reading])))
     dn = named_dn(size.name)
-    if named and dn is not None and dn <= _THICKEST_DN and dn in (size.number, size.diameter_mm):
+    if not named or dn is None or dn > _THICKEST_DN:
+        return
+    # Tubes of copper and plastic may be named by their outer diameter: DN15 of 15 mm.
+    is_nominal = dn == size.diameter_mm and not _is_standard(size.diameter_mm)
+    if is_nominal or (size.key == _RADIUS and dn == size.number):
         raise InputError(
             f"{size.where}: class {shown(size.name)}: {size.key} is {size.number:g}: is it the nominal size? "
             f"Then write {_DIAMETER}: {named[0]:g}, or the one of its material; if it is measured, take DN{dn} out of "

@@ -134,11 +134,14 @@ def test_sizes_that_differ_by_rounding_are_one(tmp_path: Path) -> None:
 
 
 @needs_ifc
-@pytest.mark.parametrize(("factor", "told"), [(1e-3, "is 0.12 mm across"), (1e3, "is 114300 mm across")])
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [(1e-3, "its pipes are 0.06 to 0.12 mm across"), (1e3, "its pipes are 60300 to 114300 mm across")],
+)
 def test_numbers_in_another_unit_than_the_file_names_are_told(tmp_path: Path, factor: float, told: str) -> None:
     pipes = [(name, kind, Cylinder(factor * p.start, factor * p.end, factor * p.radius)) for name, kind, p in PIPES]
     write_plan_ifc(tmp_path / "plan.ifc", pipes)
-    with pytest.raises(InputError, match=f"pipe 'a' {told}: the unit of length that the file names is not that of its"):
+    with pytest.raises(InputError, match=f"{told}: the unit of length that the file names is not that of its"):
         load_boq(tmp_path / "plan.ifc")
 
 

@@ -109,6 +109,7 @@ def test_every_nominal_size_in_another_unit_is_asked_about(
         ("outer_diameter_mm", {"DN65": 65, "DN100": 100}, "is it the nominal size? Then write outer_diameter_mm: 76.1"),
         ("outer_radius_mm", {"DN65": 65, "DN100": 100}, "is it the nominal size?"),
         ("outer_radius_mm", {"DN65": 32.5, "DN100": 50}, "is it the nominal size?"),
+        ("outer_radius_mm", {"DN20": 20}, "is it the nominal size?"),
     ],
 )
 def test_the_size_in_the_name_tells_the_unit(tmp_path: Path, key: str, sizes: dict[str, float], told: str) -> None:
@@ -123,6 +124,7 @@ def test_the_size_in_the_name_tells_the_unit(tmp_path: Path, key: str, sizes: di
         ("outer_diameter_mm", {"DN50 PVC": 50, "DN110": 110, "DN125": 125}, ""),  # of PVC the DN is the diameter
         ("outer_diameter_mm", {"DN300 sewer": 300, "DN150 sewer": 150}, ""),  # the bore
         ("outer_diameter_mm", {"DN100": 110, "DN50": 54}, ""),  # cast iron, copper
+        ("outer_diameter_mm", {"DN15": 15, "DN20": 20, "DN25": 25}, ""),  # tubes of copper and plastic
         ("outer_radius_mm", {"DN65": 36.5, "DN150": 84.1, "DN225": 122.3}, ""),  # ASME, and no standard
         ("outer_radius_mm", {"DN50 in 30 mm of wool": 60.15}, ", material: insulated"),
     ],
