@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
-from pipeprog_detect.silhouette.edge_support import COMMON, HIT_RATE, TEXTURE, hits, support_profile
+from pipeprog_detect.silhouette.edge_support import COMMON, EDGE, NO_EDGE, hits, support_profile
 from pipeprog_detect.silhouette.limb_edges import LimbEdges
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
@@ -45,6 +45,7 @@ class AdjustedCylinder:
         step: (5,) from the given cylinder to it; see `Scene.moved`.
         covariance: (5, 5) of the step [m^2].
         used: mask (N,) of the samples of which an edge counted.
+        hit: mask (N,) of the samples that an edge supports.
         share: support (0 to 1) of its contour.
         log_odds: logarithm of how much more probable its edges are on a pipe there than on texture.
         samples: the N contour samples.
@@ -55,6 +56,7 @@ class AdjustedCylinder:
     step: FloatArray
     covariance: FloatArray
     used: NDArray[np.bool_]
+    hit: NDArray[np.bool_]
     share: float
     log_odds: float
     samples: ContourSamples
@@ -86,9 +88,9 @@ def adjusted(scene: Scene, prior: FloatArray, so_far: FloatArray) -> AdjustedCyl
     scene = scene.moved(step)
     if scene.cylinder.radius <= 0:
         return None
-    share = support_profile(samples, hits(edges, solution.displacement)).share
-    odds = _log_odds(samples, edges, solution)
-    return AdjustedCylinder(scene, step, solution.covariance, solution.used, share, odds, samples, edges)
+    hit = hits(edges, solution.displacement)
+    share, odds = support_profile(samples, hit).share, _log_odds(samples, hit, solution)
+    return AdjustedCylinder(scene, step, solution.covariance, solution.used, hit, share, odds, samples, edges)
 
 
 def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
@@ -105,7 +107,8 @@ def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
             trials.append((step, -np.inf))
         else:
             samples, edges, solution = found
-            total, odds = step + solution.step, _log_odds(samples, edges, solution)
+            total, hit = step + solution.step, hits(edges, solution.displacement)
+            odds = _log_odds(samples, hit, solution)
             if odds > 0.0:
                 trials.append((total, max(odds - 0.5 * float(total @ prior @ total), 0.0)))
             elif step.any() or len(steps) == 1:
@@ -113,15 +116,14 @@ def best_of(scene: Scene, steps: FloatArray, prior: FloatArray) -> FloatArray:
     return max(trials, key=lambda trial: trial[1])[0]
 
 
-def _log_odds(samples: ContourSamples, edges: LimbEdges, solution: _Solution) -> float:
+def _log_odds(samples: ContourSamples, hit: NDArray[np.bool_], solution: _Solution) -> float:
     """Logarithm of how much more probable the edges are on a pipe in these places than on texture.
 
     Edges alone do not tell: one side of a pipe with the edge of its shadow is seen as often as the pipe, but at another
     depth, where the offsets of the views must make up for the parallax of cameras that are not in one line.
     """
-    hit = hits(edges, solution.displacement)
     views = len(np.unique(samples.view))
-    each = np.where(hit, np.log(HIT_RATE / TEXTURE), np.log((1.0 - HIT_RATE) / (1.0 - TEXTURE)))
+    each = np.where(hit, EDGE, NO_EDGE)
     offset = solution.view_offset[np.unique(samples.view)]
     scatter = max(float(np.sqrt(np.mean(offset**2))), LEAST_OFFSET)
     return float(each.sum() / (1.0 + COMMON * (views - 1))) - views * float(np.log(scatter / FIRST_OFFSET))

@@ -12,7 +12,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.contour_adjustment import AdjustedCylinder, adjusted, best_of
 from pipeprog_detect.silhouette.contour_fit import ContourFit, contour_fit
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
-from pipeprog_detect.silhouette.extension import RADIUS_HELD, followed
+from pipeprog_detect.silhouette.extension import RADIUS_HELD, followed, without_bend
 from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps, distinct
 from pipeprog_detect.silhouette.one_sided import SeenArc, arc_precision, only_visible_side
 from pipeprog_detect.silhouette.pipe_ends import find_ends
@@ -107,6 +107,8 @@ def refine(
             return None
         step = step + found.step
     if found is not None and follow:
+        if start.ends_known:
+            found = without_bend(found, start.cylinder, priors[-1])
         found = followed(found, start.cylinder, priors[-1], held)
     if found is None or found.share < MIN_SUPPORT:
         return None

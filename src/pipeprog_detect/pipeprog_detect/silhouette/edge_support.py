@@ -28,6 +28,8 @@ HIT_RATE = 0.7
 # Rate of edges of texture, and the correlation between views of the evidence at one position: specks of texture and
 # dark areas are common to them.
 TEXTURE, COMMON = 0.2, 0.3
+# Logarithm of how much more probable an edge is on a pipe's contour than on texture, and that none is seen.
+EDGE, NO_EDGE = float(np.log(HIT_RATE / TEXTURE)), float(np.log((1.0 - HIT_RATE) / (1.0 - TEXTURE)))
 # Support of what is taken for seen: one side along half of its length, or both along a quarter. Texture with an edge in
 # one of five views has at most 0.11 (by the binomial distribution, for any number of views).
 MIN_SUPPORT = 0.25
@@ -64,6 +66,11 @@ class SupportProfile:
         """The same on the side that has less of it; on the only one where the views see no other."""
         supported, expected = self._by_side()
         return min(float((supported[expected > 0] / expected[expected > 0]).min()), 1.0) if expected.any() else 0.0
+
+    def log_odds(self) -> FloatArray:
+        """Logarithm (B,) of how much more probable the edges at each position are on a pipe there than on texture."""
+        total = self.hits * EDGE + (self.seen - self.hits) * NO_EDGE
+        return np.asarray((total / (1.0 + COMMON * np.maximum(self.seen - 1.0, 0.0))).sum(axis=1))
 
     def _by_side(self) -> tuple[FloatArray, FloatArray]:
         """Number of positions of each side (2,) with such edges, and the number expected of a real contour."""

@@ -57,6 +57,13 @@ WORSE, SAME_RADIUS = 0.9, 3.0
 # ... or if the axis moves by more than this (chi square of four degrees of freedom, exceeded once in a thousand times)
 # and by more than this share of the radius: it then follows a pipe beside it.
 SAME_AXIS, ASIDE = 18.5, 0.5
+# The cloud's surface goes on around an elbow (of a long radius, EN 10253) for 4 radii beyond the barrel. Of what is
+# shorter than twice that half may be the elbow.
+WITH_BEND = 8.0
+# Support of a stub of which half is straight, with what the first third of the bend adds, which is nearly straight.
+HALF_SEEN = 0.7
+# Rounds in which a stub is cut to where its contour is seen.
+CUTS = 3
 # With less than this share of the former support it is not extended at all: there is something else.
 LOST = 0.5
 
@@ -102,6 +109,38 @@ def followed(known: AdjustedCylinder, start: Cylinder, prior: FloatArray, held: 
         else:
             known = again
     return known
+
+
+def without_bend(known: AdjustedCylinder, start: Cylinder, prior: FloatArray) -> AdjustedCylinder:
+    """A stub between the positions from which on its contour is not seen; what is longer stays as it is.
+
+    The cloud's surface goes on around an elbow, whose edges lead the axis of a stub aside. `prior` (5, 5): precision
+    [1/m^2] of the `start`.
+    """
+    for _ in range(CUTS):
+        cylinder = known.cylinder
+        if cylinder.length > WITH_BEND * cylinder.radius or known.share > HALF_SEEN:
+            break
+        scene = replace(known.scene, cylinder=_where_seen(known))
+        shorter = adjusted(scene, prior, _step_from(start, scene))
+        if shorter is None or shorter.share <= known.share:
+            break
+        known = shorter
+    return known
+
+
+def _where_seen(known: AdjustedCylinder) -> Cylinder:
+    """The stretch of a cylinder whose edges are most probable on a pipe; all of it where none are."""
+    profile = support_profile(known.samples, known.hit)
+    total = np.append(0.0, np.cumsum(profile.log_odds()))
+    least = np.minimum.accumulate(total)
+    last = int(np.argmax(total - least))
+    first = int(np.argmin(total[: last + 1]))
+    if first == last:
+        return known.cylinder
+    half = 0.5 * known.cylinder.length
+    between = np.concatenate([[-half], 0.5 * (profile.along[1:] + profile.along[:-1]), [half]])
+    return known.cylinder.cut(float(between[first]) + half, float(between[last]) + half)
 
 
 def _step_from(start: Cylinder, scene: Scene) -> FloatArray:
@@ -201,7 +240,7 @@ def axial_evidence(scene: Scene, at_end: bool, ahead: float) -> AxialEvidence | 
     on = support_profile(samples, hit)
     along = on.along + 0.5 * (ahead - back)
     known = along < 0
-    if on.seen[known].sum() < MIN_SAMPLES:
+    if on.seen[known].sum() < MIN_SAMPLES or len(along) < 2:
         return None
     aside = 2.0 * cylinder.radius + BESIDE / on.gain
     chance = _chance([beyond(sign * aside, 0.0).support(TOLERANCE, SPACING, SAMPLES_BESIDE) for sign in (-1.0, 1.0)])

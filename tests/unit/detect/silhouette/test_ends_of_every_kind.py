@@ -82,3 +82,27 @@ def test_a_pipe_ends_where_its_barrel_does(
     before, beyond = PIPES[name][1] - start, end - PIPES[name][2]
     assert -shorter[0] < before < longer[0]
     assert -shorter[1] < beyond < longer[1]
+
+
+STUB = Cylinder(np.array([0.0, BEFORE, 0.12]), np.array([0.0, BEFORE, 0.0]), RADIUS)
+
+
+@pytest.fixture(scope="module")
+def stub_views() -> list[View]:
+    bend = 2.2 * RADIUS
+    corner = STUB.start - bend_tangent(-STUB.axis, LEFT, bend) * STUB.axis
+    other = corner + bend * LEFT
+    things = [cylinder(STUB.start, STUB.end, RADIUS, GREEN), cylinder(other, other + 0.4 * LEFT, RADIUS, GREEN)]
+    return walk_past([*things, elbow(corner, -STUB.axis, LEFT, RADIUS, bend, GREEN)])
+
+
+@pytest.mark.parametrize("around", [0.06, 0.08, 0.1])
+@pytest.mark.parametrize("aside", [-0.02, 0.0, 0.02])
+def test_a_stub_ends_before_its_elbow(stub_views: list[View], around: float, aside: float) -> None:
+    """Found by a cloud's surface that goes on around the bend and leads the axis aside [m]."""
+    start = Cylinder(STUB.start - around * STUB.axis + aside * np.array([0.0, 1.0, 0.0]), STUB.end, RADIUS)
+    found = refine(Start(start, 0.002, ends_known=True), stub_views, [])
+    assert found is not None
+    beyond = max(float(each[2]) for each in (found.cylinder.start, found.cylinder.end)) - float(STUB.start[2])
+    assert -HALF_PIXEL < beyond < AT_ELBOW
+    assert abs(found.cylinder.radius - RADIUS) < 3.0 * found.radius_sigma < 2e-3
