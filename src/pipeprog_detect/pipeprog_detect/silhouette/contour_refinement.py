@@ -106,9 +106,9 @@ def refine(
         if found is None:
             return None
         step = step + found.step
+    if found is not None and start.ends_known:
+        found = without_bend(found, start.cylinder, priors[-1])
     if found is not None and follow:
-        if start.ends_known:
-            found = without_bend(found, start.cylinder, priors[-1])
         found = followed(found, start.cylinder, priors[-1], held)
     if found is None or found.share < MIN_SUPPORT:
         return None
