@@ -16,6 +16,7 @@ from pipeprog_detect.types import Cylinder, Pipe, PipeEnd
 
 # A bend of 3 radii (a long-radius elbow) leaves the line of its pipe by s^2 / (2 * 3 r) at s beyond its beginning; less
 # than 4 mm (1.5 px at 2.5 m with 1000 px) does not show in the contour, so that the end may lie anywhere along that.
+# The legs of an elbow are equal: of two ends that differ by no more the one nearer to the corner lies in the bend.
 _ELBOW_RADII, _ELBOW_SHOWS = 3.0, 4e-3
 
 
@@ -24,7 +25,8 @@ class Joint:
     """A fitting between the pipes with these ids; angle [rad] of its turn, length [m] along the centre line.
 
     kind is "elbow", "reducer", "coupling" or "tee"; of a tee the first pipe is the branch, whose centre line reaches
-    the other's axis. `miss` is how far the axes pass each other [m], NaN where it is not known.
+    the other's axis. `miss` is how far the axes pass each other [m], NaN where it is not known; `into_bend` [m] how far
+    each pipe was measured on into the bend of an elbow.
     """
 
     kind: str
@@ -32,6 +34,7 @@ class Joint:
     angle: float
     length: float
     miss: float = float("nan")
+    into_bend: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def pipe_runs(pipes: Sequence[Pipe]) -> list[PipeRun]:
     for run in range(count):
         own = [pipe for pipe, its in zip(pipes, label, strict=True) if its == run]
         fittings = tuple(joint for joint in joints if label[number[joint.pipes[0]]] == run)
-        barrel = sum(pipe.cylinder.length for pipe in own)
+        barrel = sum(pipe.cylinder.length for pipe in own) - sum(sum(joint.into_bend) for joint in fittings)
         centre_line = barrel + sum(joint.length for joint in fittings)
         runs.append(PipeRun(f"r{run + 1:02d}", tuple(pipe.id for pipe in own), fittings, barrel, centre_line))
     return runs
@@ -91,24 +94,30 @@ def find_joints(pipes: Sequence[Pipe]) -> list[Joint]:
 
 
 def with_fittings(pipes: Sequence[Pipe], runs: Sequence[PipeRun]) -> list[Pipe]:
-    """The pipes of the runs, with the ends at which fittings begin."""
+    """The pipes of the runs, with the ends at which fittings begin, and no longer than to there."""
     result = {pipe.id: pipe for pipe in pipes}
     for joint in (joint for run in runs for joint in run.joints):
-        first, second = joint.pipes
-        for own, other in ((first, second), (second, first)):
-            if joint.kind == "tee" and own == second:
-                continue  # the run of a tee goes on
+        for place in (0,) if joint.kind == "tee" else (0, 1):  # the run of a tee goes on
+            own, other = joint.pipes[place], joint.pipes[1 - place]
             pipe, beside = result[own], result[other].cylinder
-            at_end = _distance(pipe.cylinder.end, beside) < _distance(pipe.cylinder.start, beside)
+            cylinder, further = pipe.cylinder, joint.into_bend[place]
+            at_end = _distance(cylinder.end, beside) < _distance(cylinder.start, beside)
             start, end = pipe.ends
-            fitted = _at_fitting(end if at_end else start, joint.kind, pipe.cylinder.radius)
-            result[own] = replace(pipe, ends=(start, fitted) if at_end else (fitted, end))
+            fitted = _at_fitting(end if at_end else start, joint, cylinder.radius)
+            within = (0.0, cylinder.length - further) if at_end else (further, cylinder.length)
+            ends = (start, fitted) if at_end else (fitted, end)
+            result[own] = replace(pipe, cylinder=cylinder.cut(*within), ends=ends)
     return list(result.values())
 
 
-def _at_fitting(end: PipeEnd, kind: str, radius: float) -> PipeEnd:
-    hidden = np.sqrt(2.0 * _ELBOW_RADII * radius * _ELBOW_SHOWS) if kind == "elbow" else 0.0
+def _at_fitting(end: PipeEnd, joint: Joint, radius: float) -> PipeEnd:
+    hidden = _bend_hides(radius) - sum(joint.into_bend) if joint.kind == "elbow" else 0.0
     return PipeEnd(float(np.hypot(end.sigma, hidden / np.sqrt(3.0))), "fitting")
+
+
+def _bend_hides(radius: float) -> float:
+    """How far [m] a barrel may be measured on into a bend."""
+    return float(np.sqrt(2.0 * _ELBOW_RADII * radius * _ELBOW_SHOWS))
 
 
 def _distance(point: FloatArray, cylinder: Cylinder) -> float:
@@ -142,9 +151,13 @@ def _between_ends(first: Pipe, second: Pipe, a: int, b: int) -> tuple[float, Joi
     s, t, miss = _meeting(from_, out, to, back)
     if miss > fittings.miss_allowed(thin) or not fittings.is_elbow(s, t, turn, thick):
         return None
-    # The bend begins where the nearer end is; what the other has more is straight socket.
-    tangent = max(min(s, t), 0.0)
-    return miss, Joint("elbow", ids, turn, tangent * turn / float(np.tan(0.5 * turn)) + abs(s - t), miss)
+    further = (max(t - s, 0.0), max(s - t, 0.0))
+    farther_end = second.ends[b] if t > s else first.ends[a]
+    if max(further) > _bend_hides(thick) or farther_end.sigma > max(further):
+        # The bend begins where the nearer end is; what the other has more is straight socket.
+        tangent = max(min(s, t), 0.0)
+        return miss, Joint("elbow", ids, turn, tangent * turn / float(np.tan(0.5 * turn)) + abs(s - t), miss)
+    return miss, Joint("elbow", ids, turn, max(s, t) * turn / float(np.tan(0.5 * turn)), miss, further)
 
 
 def _branch(first: Pipe, second: Pipe, a: int) -> tuple[float, Joint] | None:

@@ -38,7 +38,8 @@ class Product:
 def product_of(pipes: Sequence[Pipe], boq: BillOfQuantities, scale_sigma: float = float("nan")) -> Product:
     """The product that these pipes make; their ids are final."""
     runs = pipe_runs(pipes)
-    return Product(with_fittings(pipes, runs), progress(pipes, boq), runs, scale_sigma)
+    fitted = with_fittings(pipes, runs)
+    return Product(fitted, progress(fitted, boq), runs, scale_sigma)
 
 
 def _length_sigma(pipes: Sequence[Pipe], scale_sigma: float) -> float:

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeprog_detect.product.pipe_runs import find_joints, pipe_runs
-from pipeprog_detect.types import Cylinder, Pipe
+from pipeprog_detect.product.pipe_runs import find_joints, pipe_runs, with_fittings
+from pipeprog_detect.types import Cylinder, Pipe, PipeEnd
 from sitegen.field import build_field
 from sitegen.primitives import Kind
 
@@ -54,6 +56,35 @@ def test_elbows_of_any_turn(turn: float, bend: float, spin: float) -> None:
     assert run.centre_line == pytest.approx(1.5 + bend * radius * turn, rel=1e-6)
     turned = [Cylinder(pipe.end, pipe.start, pipe.radius) for pipe in reversed(joined)]
     assert pipe_runs(pipes(*turned))[0].centre_line == pytest.approx(run.centre_line)
+
+
+@given(into=st.floats(0.0, 0.03), hand=st.sampled_from([(0, 1), (1, 0)]), turned=st.booleans())
+def test_the_end_that_lies_in_the_bend_is_where_the_other_leg_begins(
+    into: float, hand: tuple[int, int], turned: bool
+) -> None:
+    """Up to 35 mm of a bend on a pipe of 50 mm do not show in its contour."""
+    far = cylinder((0.0, 0.0, 0.0), (1.0 + into * hand[0], 0.0, 0.0))
+    up = cylinder((1.0 + BEND, BEND - into * hand[1], 0.0), (1.0 + BEND, 0.9, 0.0))
+    if turned:
+        far = Cylinder(far.end, far.start, far.radius)
+    measured = pipes(far, up)
+    runs = pipe_runs(measured)
+    first, second = with_fittings(measured, runs)
+    assert first.cylinder.length == pytest.approx(1.0)
+    assert second.cylinder.length == pytest.approx(0.9 - BEND)
+    assert runs[0].barrel == pytest.approx(first.cylinder.length + second.cylinder.length)
+    assert runs[0].centre_line == pytest.approx(1.0 + 0.9 - BEND + 0.5 * np.pi * BEND)
+    assert first.ends[0 if turned else 1].state == second.ends[0].state == "fitting"
+
+
+@pytest.mark.parametrize(("missing", "sigma"), [(0.06, 0.002), (0.02, 0.03)])
+def test_a_leg_with_a_hidden_end_does_not_shorten_the_other(missing: float, sigma: float) -> None:
+    """An end that something hides lies before the elbow: no bend makes legs so unequal, or its sigma says so."""
+    short = cylinder((0.0, 0.0, 0.0), (1.0 - missing, 0.0, 0.0))
+    first, second = pipes(short, UP)
+    measured = [replace(first, ends=(PipeEnd(), PipeEnd(sigma))), second]
+    fitted = with_fittings(measured, pipe_runs(measured))
+    assert [each.cylinder.length for each in fitted] == pytest.approx([1.0 - missing, 0.9 - BEND])
 
 
 def test_a_tee_and_a_reducer() -> None:
