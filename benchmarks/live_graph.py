@@ -90,9 +90,12 @@ class LiveGraph:
             os.kill(each, signal.SIGKILL)
         return bool(found)
 
-    def memory(self) -> dict[str, float]:
-        """MB that each process holds for itself: its unique set, its worker's without."""
-        return {name: _unique_mb(process.pid) for name, process in self._processes.items()}
+    def memory(self, workers: bool = False) -> dict[str, float]:
+        """MB that each node's process holds for itself: its unique set, that of its `workers` if asked for."""
+        return {
+            name: sum(_unique_mb(each) for each in (process.pid, *(_workers(process.pid) if workers else ())))
+            for name, process in self._processes.items()
+        }
 
     def _start(self, name: str) -> None:
         self.starts[name] += 1
@@ -118,7 +121,9 @@ def _unique_mb(number: int) -> float:
 
 
 class Robot:
-    """A robot whose camera never rests, and the client of its surveys."""
+    """A robot whose camera never rests, and the client of its surveys; `patience` [s] is what it waits at the most."""
+
+    patience = PATIENCE
 
     def __init__(self, graph: LiveGraph, frames: Sequence[ImageMessage], patient: bool = False) -> None:
         """`frames`: what it passes on its walk; it goes on once an image of a place was decided on.
@@ -194,11 +199,11 @@ class Robot:
         raise RuntimeError(f"the goal {name} was refused {ATTEMPTS} times")
 
     def wait_for(self, condition: Callable[[], object], each: Callable[[], None] = lambda: None) -> None:
-        """Lets time pass until a condition holds; raises TimeoutError after PATIENCE."""
-        deadline = time.monotonic() + PATIENCE
+        """Lets time pass until a condition holds; raises TimeoutError when patience is over."""
+        deadline = time.monotonic() + self.patience
         while not condition():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"waited {PATIENCE:.0f} s in vain")
+                raise TimeoutError(f"waited {self.patience:.0f} s in vain")
             self._executor.spin_once(timeout_sec=PERIOD)
             self._graph.supervise()
             each()

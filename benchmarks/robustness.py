@@ -108,6 +108,7 @@ FACTORS: dict[str, dict[str, Shot]] = {
     "texture, 1 is rich": {f"{r:g}": _option("--richness={:g}")(r) for r in (1.0, 0.3, 0.05)},
     "exposure [ms]": {f"{e:g}": _option("--exposure-ms={:g}")(e) for e in (0.0, 4.0, 12.0)},
     "rolling shutter [ms]": {f"{t:g}": _option("--readout-ms={:g}")(t) for t in (0.0, 15.0, 30.0)},
+    "share of the images lost": {"0": Shot(), "0.5": Shot(fps=8.0, options=("--drop=0.5",))},
     "speed [m/s], phone with 4 ms and 15 ms": {
         "0.2": Shot(speed=0.2, fps=2.0, options=PHONE),
         "0.75": Shot(options=PHONE),

@@ -67,6 +67,11 @@ ADVICE = {
         "Nearer, an image shows less than the whole length of a pipe; farther away, a thin pipe is only a few pixels "
         "wide.",
     ),
+    "share of the images lost": (
+        "Record on the robot where the network is poor; images lost at random cost little.",
+        "Half of eight images a second never arrive here. What counts is that neighbouring keyframes overlap, not that "
+        "each image comes.",
+    ),
     "rolling shutter [ms]": (
         "Prefer a camera with a global shutter; of a rolling one, as phones have, tell the read-out time where you "
         "know it (`--set sfm.readout=0.015`, or `readout` in the camera's file), and sway and turn a little as you "

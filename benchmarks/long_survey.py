@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live survey of half an hour: memory, answers, and what became of each image.
+
+    .venv/bin/python -m benchmarks.long_survey [--minutes 30]
+
+A robot walks along the demo and back, again and again, at its own pace, with ten images of 720p a second (each frame of
+the demo twice). Once a minute the memory is read that each node and its worker hold for themselves. Once a second each
+node is asked for a parameter: the time to its answer is that of its longest callback meanwhile, or more. Each image
+that was sent must have a decision. Writes results/long_survey.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from rcl_interfaces.srv import GetParameters
+from rclpy.client import Client
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage
+
+from benchmarks.live_graph import MODULES, PATIENCE, LiveGraph, Robot, demo_frames
+from benchmarks.survey import RESULTS, commit
+from pipeprog_bringup.playback.private_network import private_network
+from pipeprog_msgs.msg import FrameDecision
+from pipeprog_node import messages
+
+IMAGES_PER_FRAME = 2  # the demo has 5 frames a second
+WARM = 5  # minutes after which memory is to be flat
+ASKED = 1.0  # s between two questions to a node
+
+
+class Walker(Robot):
+    """A robot that walks along the demo and back, whatever becomes of its images, for some minutes."""
+
+    def __init__(self, graph: LiveGraph, minutes: int) -> None:
+        self._minutes, self._began = minutes, 0.0
+        self.patience = 60.0 * minutes + PATIENCE
+        self.sent = 0
+        self.decided: dict[int, str] = {}  # reason of the last decision by stamp of the image
+        self.slowest = dict.fromkeys(MODULES, 0.0)  # s to an answer
+        self.rows: list[dict[str, Any]] = []
+        frames = demo_frames()
+        super().__init__(graph, frames)
+        there = [
+            (deserialize_message(frame.camera_info, CameraInfo), deserialize_message(frame.data, CompressedImage))
+            for frame in frames
+        ]
+        self._path = [each for each in (*there, *there[-2:0:-1]) for _ in range(IMAGES_PER_FRAME)]
+        self._frame_id = frames[0].frame_id
+        self._clients = {name: self._node.create_client(GetParameters, f"{name}/get_parameters") for name in MODULES}
+        self._asked: dict[str, tuple[float, Any]] = {}
+
+    @property
+    def is_at_the_end(self) -> bool:
+        """Whether the time is over."""
+        return bool(self._began) and time.monotonic() - self._began > 60.0 * self._minutes
+
+    def look(self) -> None:
+        """Asks the nodes, and reads their memory once a minute."""
+        for name, client in self._clients.items():
+            self._ask(name, client)
+        minute = len(self.rows) + 1
+        if self._began and time.monotonic() - self._began > 60.0 * minute and minute <= self._minutes:
+            memory = self._graph.memory(workers=True)
+            self.rows.append(
+                {
+                    "minute": minute,
+                    "images": self.sent,
+                    "keyframes": self._chosen,
+                    **{f"{name} [MB]": round(value) for name, value in memory.items()},
+                    "all [MB]": round(sum(memory.values())),
+                    **{f"slowest answer of {name} [s]": round(value, 2) for name, value in self.slowest.items()},
+                }
+            )
+            print(json.dumps(self.rows[-1]), flush=True)
+
+    def _ask(self, name: str, client: Client) -> None:
+        now = time.monotonic()
+        if name in self._asked:
+            since, answer = self._asked[name]
+            self.slowest[name] = max(self.slowest[name], now - since)
+            if answer.done() and now - since > ASKED:
+                del self._asked[name]
+        elif client.service_is_ready() and self._began:
+            asked = client.call_async(GetParameters.Request(names=["use_sim_time"]))
+            self._asked[name] = (now, asked)
+
+    def _film(self) -> None:
+        if not self._is_filming() or self.is_at_the_end:
+            return
+        self._began = self._began or time.monotonic()
+        info, image = self._path[self.sent % len(self._path)]
+        info.header = image.header = messages.header(time.time_ns(), self._frame_id)
+        self._infos.publish(info)
+        self._images.publish(image)
+        self.sent += 1
+
+    def _on_decision(self, message: FrameDecision) -> None:
+        super()._on_decision(message)
+        self.decided[messages.stamp_ns(message.header.stamp)] = message.reason
+
+
+def growth(rows: list[dict[str, Any]]) -> float:
+    """Percent a minute by which memory grows once the graph is warm."""
+    warm = [(row["minute"], row["all [MB]"]) for row in rows if row["minute"] > WARM]
+    if len(warm) < 2:
+        return float("nan")
+    minute, memory = np.array(warm, float).T
+    return float(100.0 * np.polyfit(minute, memory, 1)[0] / memory.mean())
+
+
+def main() -> None:
+    """Measures and writes."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.long_survey", description=__doc__)
+    parser.add_argument("--minutes", type=int, default=30)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch, private_network(Path(scratch)):
+        rclpy.init()
+        with LiveGraph(Path(scratch), {}) as graph:
+            robot = Walker(graph, options.minutes)
+            robot.activate()
+            answer = robot.survey("long", robot.look)
+    decisions = Counter(reason.split(":")[0].rstrip(" 0123456789.<>") for reason in robot.decided.values())
+    result = {
+        "title": "A live survey of half an hour",
+        "command": f"python -m benchmarks.long_survey --minutes {options.minutes}",
+        "commit": commit(),
+        "findings": {
+            "images sent": robot.sent,
+            "images with a decision": len(robot.decided),
+            "decisions": dict(decisions.most_common(8)),
+            "pipes": [pipe.class_name for pipe in answer.result.pipes.pipes],
+            "error code": int(answer.result.error_code),
+            f"growth of memory from minute {WARM} on, a minute [%]": round(growth(robot.rows), 2),
+            "slowest answer of a node [s]": round(max(robot.slowest.values()), 2),
+        },
+        "rows": robot.rows,
+    }
+    (RESULTS / "long_survey.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
