@@ -113,9 +113,10 @@ class KeyframeVerifier:
         if fit is None and not (trusted and is_resolved(candidate)):
             return None
         if candidate.blurred or not trusted:
-            # Where noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
+            # Where noise hides the section only the planned radii tell a thin pipe from the edge of a plate; where an
+            # elbow is part of it they tell a stub.
             if fit is None or not self._fitter.is_planned(fit):
-                fit = self._fitter.of_planned_radius(candidate, others, self._views) if candidate.blurred else None
+                fit = self._fitter.of_planned_radius(candidate, others, self._views)
             elif self._fitter.strays(candidate, fit):
                 fit = self._fitter.of_planned_radius(candidate, others, self._views) or fit
             if fit is None or (candidate.blurred and not self._stands_alone(fit.cylinder, others)):
