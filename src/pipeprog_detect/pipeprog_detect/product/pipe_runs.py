@@ -111,7 +111,7 @@ def with_fittings(pipes: Sequence[Pipe], runs: Sequence[PipeRun]) -> list[Pipe]:
 
 
 def _at_fitting(end: PipeEnd, joint: Joint, radius: float) -> PipeEnd:
-    hidden = _bend_hides(radius) - sum(joint.into_bend) if joint.kind == "elbow" else 0.0
+    hidden = max(_bend_hides(radius) - sum(joint.into_bend), 0.0) if joint.kind == "elbow" else 0.0
     return PipeEnd(float(np.hypot(end.sigma, hidden / np.sqrt(3.0))), "fitting")
 
 
