@@ -39,7 +39,7 @@ class FakeRobot(Node):
         self.said: list[str] = []
         self.failing: list[str] = []
         self.blocked: set[str] = set()
-        self.is_killed = self._is_filming = self._end_asked = False
+        self.is_killed = self._is_lost = self._is_filming = self._end_asked = False
         group = ReentrantCallbackGroup()
         options: dict[str, Any] = {"callback_group": group}
         self._actions = [
@@ -59,14 +59,17 @@ class FakeRobot(Node):
         self.create_service(Trigger, "spot/stop", self._on_stop, **options)
 
     def _on_goal(self, goal: Survey.Goal) -> GoalResponse:
-        return GoalResponse.REJECT if self._is_filming else GoalResponse.ACCEPT
+        """Notes an accepted goal here: its client may go on before another thread executes it."""
+        if self._is_filming:
+            return GoalResponse.REJECT
+        self._is_lost = self.is_killed and not self.said
+        self._is_filming, self._end_asked = True, self.is_killed and not self._is_lost
+        self.said.append(f"survey {goal.survey_id}")
+        return GoalResponse.ACCEPT
 
     def _survey(self, handle: Any) -> Survey.Result:
-        is_killed = self.is_killed and not self.said
-        self._is_filming, self._end_asked = True, self.is_killed and not is_killed
         name = handle.request.survey_id
-        self.said.append(f"survey {name}")
-        if is_killed:
+        if self._is_lost:
             self._is_filming = False
             while rclpy.ok() and len(self.said) < 2:
                 time.sleep(WAIT)
