@@ -68,9 +68,8 @@ ADVICE = {
         "wide.",
     ),
     "share of the images lost": (
-        "Record on the robot where the network is poor; images lost at random cost little.",
-        "Half of eight images a second never arrive here. What counts is that neighbouring keyframes overlap, not that "
-        "each image comes.",
+        "Record on the robot where the network is poor.",
+        "Here half of eight images a second are lost at random: neighbouring keyframes must still overlap.",
     ),
     "rolling shutter [ms]": (
         "Prefer a camera with a global shutter; of a rolling one, as phones have, tell the read-out time where you "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a pipe goes on beyond its known part: along its axis, while the keyframes show its contour."""
+"""How far a pipe goes along its axis: beyond its known part, and on a stub no farther, than its contour is seen."""
 
 from __future__ import annotations
 
