@@ -86,8 +86,9 @@ class Walker(Robot):
         now = time.monotonic()
         if name in self._asked:
             since, answer = self._asked[name]
-            self.slowest[name] = max(self.slowest[name], now - since)
-            if answer.done() and now - since > ASKED:
+            if not answer.done():
+                self.slowest[name] = max(self.slowest[name], now - since)
+            elif now - since > ASKED:
                 del self._asked[name]
         elif client.service_is_ready() and self._began:
             asked = client.call_async(GetParameters.Request(names=["use_sim_time"]))
