@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -158,9 +159,9 @@ class Nodes:
         self._commands[name] = command
         self._processes[name] = subprocess.Popen(command)
 
-    def kill_and_start_again(self, name: str) -> None:
+    def kill_and_start_again(self, name: str, how: int = signal.SIGKILL) -> None:
         """As a launch file does with what dies."""
-        self._processes[name].kill()
+        self._processes[name].send_signal(how)
         self._processes[name].wait()
         self.start(name, self._commands[name])
 
@@ -203,7 +204,7 @@ def test_surveys_come_one_after_another(mission: Mission, nodes: Nodes) -> None:
     assert outside.status == GoalStatus.STATUS_ABORTED
     assert outside.result.error_code == Survey.Result.BAD_INPUT
     assert "survey_id" in outside.result.error_msg
-    assert not surveys.exists()
+    assert not list(surveys.glob("[!.]*"))
 
     handle = mission.send(survey_id="first")
     assert handle.accepted
@@ -269,3 +270,11 @@ def test_a_survey_goes_on_where_its_own_node_was_killed(mission: Mission, nodes:
     assert not list(folder.glob(".pipeprog-*"))
     bag = Bag.open(folder / "out.mcap")
     assert bag.image_count == answer.result.sfm.keyframes_seen >= keyframes
+
+    nodes.kill_and_start_again("survey")  # as if before it answered
+    again = mission.result(mission.send_again(survey_id="killed"))
+    assert again.status == GoalStatus.STATUS_SUCCEEDED
+    assert (again.result.folder, again.result.pipes) == (answer.result.folder, answer.result.pipes)
+    nodes.kill_and_start_again("survey", signal.SIGINT)
+    mission.meet()
+    assert not mission.send().accepted  # who stops a node does not want it to be active again

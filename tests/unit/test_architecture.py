@@ -46,7 +46,7 @@ GLUE = {
     "pipeprog_bringup": {
         *{"replay", "session", "connections", "player", "listener", "survey_writer", "outline_marker"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},
-        *{"survey_client", "conduct", "alignment_result", "waiting_client", "progress"},
+        *{"survey_client", "conduct", "alignment_result", "waiting_client", "progress", "takeover"},
     },
 }
 # Inside a package: which folder may import which; modules beside node.py may import all of them,

@@ -6,18 +6,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeprog_msgs.action import Survey
-from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
+from pipeprog_sfm.alignment.map_file import read_map
 
 _BEFORE_ALIGNMENT = "not aligned with the reference, so the pipes are in a frame of their own: only the last map of a "
 _BEFORE_ALIGNMENT += "survey is aligned, and this one was ended before"
 
 
-def note_alignment(result: Survey.Result, folder: Path) -> None:
+def note_alignment(result: Survey.Result, path: Path) -> None:
     """Notes how well the survey lies in the frame of its reference, or NOT_ALIGNED and why.
 
-    `folder`: of a survey with pipes; it has a map.npz where the last map was made.
+    `path`: of the map.npz of a survey with pipes; it is there where the last map was made.
     """
-    path = folder / MAP_FILE
     survey = read_map(path) if path.is_file() else None
     if survey is not None and survey.aligned_by:
         result.reference_covariance = survey.alignment_covariance[:6, :6].ravel()

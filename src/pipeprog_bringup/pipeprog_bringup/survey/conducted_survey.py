@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from functools import partial
 from typing import Any
 
@@ -49,14 +50,16 @@ class ConductedSurvey:
         tick: Callable[[], Awaitable[None]],
         is_end_asked: Callable[[], bool],
         lack: Callable[[], str],
+        keep: Callable[[Survey.Result], None],
     ) -> None:
         """`node` is this survey's alone; `tick` waits for a moment.
 
-        `is_end_asked`: filming is to end; `lack`: why no images come, empty: not known. Where `journal` tells of a
-        process that was killed, the survey goes on from there.
+        `is_end_asked`: filming is to end; `lack`: why no images come, empty: not known; `keep` keeps the result for the
+        case that this process is killed before it answers. Where `journal` tells of a process that was killed, the
+        survey goes on from there.
         """
         self._client, self._goal, self._output, self._journal = client, goal, output, journal
-        self._wait, self._is_end_asked, self._lack = tick, is_end_asked, lack
+        self._wait, self._is_end_asked, self._lack, self._keep = tick, is_end_asked, lack, keep
         self._started = self._told = self._looked = time.monotonic()
         self._stopped = False  # a cancel is heard until it is obeyed
         self._is_full = False
@@ -97,7 +100,7 @@ class ConductedSurvey:
         except Cancelled:
             result.error_msg = ""
         self._stopped = True
-        await self._written(result, survey or passage.maps.newest, settings)
+        result = await self._written(result, survey or passage.maps.newest, settings)
         await self._at_rest()
         return result
 
@@ -111,8 +114,10 @@ class ConductedSurvey:
         progress.begun = await passage.begin(self._goal, self._output.colmap, self._output.journal)
         self._journal.note()
 
-    async def _written(self, result: Survey.Result, survey: LastMessages | None, settings: dict[str, Any]) -> None:
-        """Writes what there is and notes it in the result; without a frame there is nothing."""
+    async def _written(
+        self, result: Survey.Result, survey: LastMessages | None, settings: dict[str, Any]
+    ) -> Survey.Result:
+        """Writes what there is: the result with what was written; without a frame there is nothing."""
         passage, output = self._passage, self._output
         passage.stage = Survey.Feedback.WRITING
         result.sfm = passage.listener.status
@@ -121,22 +126,31 @@ class ConductedSurvey:
             result.error_msg = f"filming ended early: the disk of {output.path} is nearly full"
         if not passage.log.considered:
             output.discard()
-            return
-        write = partial(output.write, survey, passage.listener.status, passage.log, self._about(settings))
-        with ThreadPoolExecutor(1) as writer:
-            written = writer.submit(write)
-            while not written.done():
-                await self._tick()
+            return result
         try:
-            written.result()
+            about = self._about(settings)
+            await self._done(partial(output.write, survey, passage.listener.status, passage.log, about))
+            complete = copy(result)
+            complete.folder = str(output.path.resolve())
+            if survey is not None:
+                complete.pipes = survey.pipes
+                if self._goal.reference is not None:
+                    note_alignment(complete, output.map)
+            complete.total_elapsed_time = messages.duration_msg(time.monotonic() - self._started)
+            self._keep(complete)
+            await self._done(output.publish)
         except InputError as error:
             result.error_code, result.error_msg = Survey.Result.NO_SPACE, str(error)
-            return
-        result.folder = str(output.path.resolve())
-        if survey is not None:
-            result.pipes = survey.pipes
-            if self._goal.reference is not None:
-                note_alignment(result, output.path)
+            return result
+        return complete
+
+    async def _done(self, work: Callable[[], None]) -> None:
+        """Waits for work that is done beside."""
+        with ThreadPoolExecutor(1) as worker:
+            done = worker.submit(work)
+            while not done.done():
+                await self._tick()
+        done.result()
 
     async def _at_rest(self) -> None:
         """The nodes wait for the next survey; one that does not answer now is asked again when that begins."""

@@ -27,6 +27,7 @@ from pipeprog_bringup.survey.progress import site_progress
 from pipeprog_bringup.survey.robot_input import RobotInput
 from pipeprog_bringup.survey.survey_journal import unfinished
 from pipeprog_bringup.survey.survey_output import SurveyOutput
+from pipeprog_bringup.survey.takeover import SIGN_PERIOD, Takeover
 from pipeprog_bringup.survey.waiting_client import Client
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import for_terminal
@@ -53,6 +54,7 @@ class SurveyNode(LifecycleNode):
         self._cameras = declare_fixed(self, "cameras", "", "of a rig, as of frames: whose images are kept").split()
         self._running: Client | None = None
         self._left = unfinished(self._results)
+        self._takeover = Takeover(self._results, self.get_fully_qualified_name())
         self._is_active = self._end_asked = False
         self._waiting: list[Future] = []
         group = ReentrantCallbackGroup()  # while a survey waits, the other callbacks must run
@@ -72,6 +74,7 @@ class SurveyNode(LifecycleNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(TICK, self._wake, callback_group=group, clock=steady)
         self._taking_up = self.create_timer(TICK, self._take_up, callback_group=group, clock=steady)
+        self._sign = self.create_timer(SIGN_PERIOD, self._show_life, callback_group=group, clock=steady)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reads the files that the parameters name, so that a mistake is known before the robot walks."""
@@ -86,6 +89,7 @@ class SurveyNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Goals are accepted; a survey whose node was killed a moment ago goes on."""
         self._is_active = True
+        self._show_life()
         left, self._left = self._left, None
         if left is not None and self._running is None:
             request = deserialize_message(left.goal, Survey.Goal)
@@ -95,16 +99,27 @@ class SurveyNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """No goal is accepted any more; the survey that is filmed goes on to its result."""
         self._is_active = False
+        self._takeover.end()
         self._end_asked = True
         return super().on_deactivate(state)
 
     def _take_up(self) -> None:
-        """Becomes active where a survey is to go on: it was active when the process before was killed."""
+        """Becomes active where the process before was, when it was killed, and its survey goes on."""
         self._taking_up.cancel()
         if self._left is not None:
             self.get_logger().warning(f"the survey {self._left.folder.parent.name} goes on")
+        if self._left is not None or self._takeover.was_active:
             self.trigger_configure()
             self.trigger_activate()
+
+    def _show_life(self) -> None:
+        if self._is_active:
+            self._takeover.sign()
+
+    def destroy_node(self) -> None:
+        """Ends the node as its user wishes: the next one is not active by itself."""
+        self._takeover.end()
+        super().destroy_node()
 
     def _on_goal(self, request: Survey.Goal) -> GoalResponse:
         is_free = self._running is None or self._running.is_of(request)
@@ -120,7 +135,7 @@ class SurveyNode(LifecycleNode):
         request: Survey.Goal = handle.request
         client = self._running
         if client is None:
-            result = await self._run(Client("", handle), request)
+            result = self._takeover.answer_to(request) or await self._run(Client("", handle), request)
         elif client.is_of(request):
             client.handle = handle
             result = await client.result
@@ -168,7 +183,9 @@ class SurveyNode(LifecycleNode):
         robot = RobotInput(self, output, self._cameras) if self._record else None
         try:
             ended, lack = (lambda: self._end_asked), (lambda: missing_input(self, self._cameras))
-            survey = ConductedSurvey(listener, client, goal, output, journal, self._tick, ended, lack)
+            survey = ConductedSurvey(
+                listener, client, goal, output, journal, self._tick, ended, lack, self._takeover.keep
+            )
             result = await survey.run()
         finally:
             journal.close()

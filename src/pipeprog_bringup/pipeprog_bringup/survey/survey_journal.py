@@ -74,12 +74,17 @@ class Unfinished:
     goal: bytes
 
 
+def is_alive(file: Path) -> bool:
+    """Whether a process that is not there any more gave a sign of life, by touching this file, a moment ago."""
+    return file.is_file() and abs(time.time() - file.stat().st_mtime) <= _ALIVE
+
+
 def unfinished(results: Path) -> Unfinished | None:
     """The survey in the folder `results` that was conducted a moment ago, and is not any more; None without one."""
     for survey in results.iterdir() if results.is_dir() else ():
         for folder in left_behind(survey):
             file = folder / JOURNAL / _NAME
-            if not file.is_file() or abs(time.time() - file.stat().st_mtime) > _ALIVE:
+            if not is_alive(file):
                 continue
             with contextlib.suppress(InputError):
                 journal = Journal(file)

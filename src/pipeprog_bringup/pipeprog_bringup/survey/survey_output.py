@@ -32,6 +32,7 @@ from pipeprog_frames.incoming.frame_buffer import EncodedFrame
 from pipeprog_msgs import msg
 from pipeprog_node import messages
 from pipeprog_node.journal import written
+from pipeprog_sfm.alignment.map_file import MAP_FILE
 
 MIN_FREE = 1 << 30  # bytes; 1 GiB: the results of a field of 58 pipes take 0.4 GB, cloud and keyframes included
 
@@ -73,6 +74,11 @@ class SurveyOutput:
         """Where the sparse model goes."""
         return self._folder.file("colmap")
 
+    @property
+    def map(self) -> Path:
+        """Where `write` puts the map, if there is one."""
+        return self._folder.file(MAP_FILE)
+
     def journal_of(self, goal: bytes) -> SurveyJournal:
         """What the node `survey` writes down itself; raises InputError, with nothing left."""
         try:
@@ -101,7 +107,7 @@ class SurveyOutput:
     def write(
         self, survey: LastMessages | None, status: msg.SfmStatus, log: FrameLog, about: dict[str, dict[str, Any]]
     ) -> None:
-        """Writes all that there is, and gives the files their names; without a `survey` there is no map.
+        """Writes all that there is; without a `survey` there is no map.
 
         `about`: what config.yaml and run.json are to say, under `config` and `run`.
         """
@@ -119,6 +125,9 @@ class SurveyOutput:
             write_plan(self._folder.file("plan.json"), self._goal.site.boq.pipes)
         result_files.write_config(self._folder.file("config.yaml"), about["config"])
         result_files.write_run(self._folder, about["run"])
+
+    def publish(self) -> None:
+        """Gives the files their names."""
         self._open.close()
 
     def discard(self) -> None:

@@ -95,7 +95,7 @@ def test_the_result_says_how_well_a_survey_is_aligned(tmp_path: Path, aligned_by
     covariance = np.diag([4e-6] * 3 + [1e-8] * 3 + [1e-9]) if aligned_by else np.zeros((7, 7))
     write_map(tmp_path / MAP_FILE, replace(MAP, aligned_by=aligned_by, alignment_covariance=covariance))
     result = Survey.Result(sfm=SfmStatus(message="no place was found again"))
-    note_alignment(result, tmp_path)
+    note_alignment(result, tmp_path / MAP_FILE)
     assert result.error_code == code
     assert result.error_msg == ("" if aligned_by else "no place was found again")
     assert np.allclose(result.reference_covariance.reshape(6, 6), covariance[:6, :6], rtol=0.0, atol=0.0)
@@ -103,7 +103,7 @@ def test_the_result_says_how_well_a_survey_is_aligned(tmp_path: Path, aligned_by
 
 def test_a_survey_that_ended_before_its_last_map_is_not_aligned(tmp_path: Path) -> None:
     result = Survey.Result()
-    note_alignment(result, tmp_path)
+    note_alignment(result, tmp_path / MAP_FILE)
     assert result.error_code == Survey.Result.NOT_ALIGNED
     assert "ended before" in result.error_msg
 
