@@ -165,25 +165,30 @@ class Robot:
         self._place, self._shown, self._decided = -1, 0, 0
         self._chosen = self._answered = 0
         self._is_over = False
-        over = self._asked_for(name)
-        over = self._heard_of(over, name, lambda: self._is_filming() and self.is_at_the_end, each)
-        if not over.done():
-            self._called(self._end, Trigger.Request())
-        return self._heard_of(over, name, lambda: False, each).result()
-
-    def _heard_of(self, over: Any, name: str, condition: Callable[[], bool], each: Callable[[], None]) -> Any:
-        """Waits for a condition or the end; returns the future of the answer, asked for again from a node anew."""
+        over, ended = self._asked_for(name), False
         while True:
             lives = self._graph.starts["survey"]
             self.wait_for(
-                lambda over=over, lives=lives: (  # type: ignore[misc]
-                    over.done() or condition() or self._graph.starts["survey"] > lives
+                lambda over=over, ended=ended, lives=lives: (  # type: ignore[misc]
+                    over.done()
+                    or self._graph.starts["survey"] > lives
+                    or (not ended and self._is_filming() and self.is_at_the_end)
                 ),
                 each,
             )
-            if self._graph.starts["survey"] == lives:
-                return over
-            over = self._asked_for(name)
+            if self._graph.starts["survey"] > lives:  # it may have died before it noted that filming has ended
+                over, ended = self._asked_for(name), False
+            elif over.done():
+                return over.result()
+            else:
+                ended = self._has_ended()
+
+    def _has_ended(self) -> bool:
+        """Whether the node has ended filming; a node that dies meanwhile gives no answer."""
+        answer = self._end.call_async(Trigger.Request())
+        waited = time.monotonic() + ANSWER
+        self.wait_for(lambda: answer.done() or time.monotonic() > waited)
+        return bool(answer.done() and answer.result().success)
 
     def _asked_for(self, name: str) -> Any:
         """The future of a goal's answer, sent until it is accepted."""
