@@ -49,6 +49,7 @@ class SurveyClient:
         self._end = node.create_client(Trigger, f"{name}/end")
         self._matched: set[ActionClient] = set()
         self._goal, self._heard = Survey.Goal(), 0.0  # the goal, and when its survey was last heard of
+        self._end_asked = False
         self._handle: ClientGoalHandle | None = None
         self._result: Future | None = None
 
@@ -63,6 +64,7 @@ class SurveyClient:
         """Begins a survey, fields as of its goal; raises InputError where the node does not accept it."""
         files = {"boq": boq, "board": board, "reference": reference}
         self._goal = Survey.Goal(survey_id=survey_id, time_limit=messages.duration_msg(seconds), **files)
+        self._end_asked = False
         deadline = time.monotonic() + self._start_seconds
         while not self._accepted(self._goal):
             if time.monotonic() + PAUSE > deadline:
@@ -76,6 +78,7 @@ class SurveyClient:
 
     def end(self) -> None:
         """Ends filming, if a survey is filmed; the survey goes on to its result."""
+        self._end_asked = True
         deadline = time.monotonic() + ANSWER_SECONDS
         # A goal that has just been accepted is not executed yet: then the node says that there is none.
         while not self._has_ended() and not self.is_over and time.monotonic() < deadline:
@@ -89,7 +92,8 @@ class SurveyClient:
     def result(self) -> Surveyed:
         """Waits for the result of the survey that was started.
 
-        A node that is started anew goes on with a survey; the goal is sent to it once more, if the survey has a name.
+        A node that is started anew goes on with a survey; the goal is sent to it once more, if the survey has a name,
+        and so is the wish to end filming, which it may not know of.
         """
         assert self._result is not None
         began = time.monotonic()  # nothing is heard while nobody waits
@@ -111,6 +115,8 @@ class SurveyClient:
             if self._goal.survey_id and self._accepted(self._goal):
                 assert self._handle is not None
                 self._result = self._handle.get_result_async()
+                if self._end_asked:
+                    self.end()
                 return True
             self.wait(lambda: self.is_over or self._heard > silent, PAUSE)
         return self._heard > silent or self.is_over

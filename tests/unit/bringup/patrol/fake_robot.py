@@ -31,7 +31,8 @@ class FakeRobot(Node):
         said: goals, ends and moves in their order.
         failing: error messages of the next surveys, one each; an empty one succeeds.
         blocked: waypoints that are not reached.
-        is_killed: whether nothing is heard of the first survey; the next one ends at once.
+        is_killed: whether nothing is heard of the first survey.
+        ends_itself: whether the survey after that one ends at once.
     """
 
     def __init__(self) -> None:
@@ -40,6 +41,7 @@ class FakeRobot(Node):
         self.failing: list[str] = []
         self.blocked: set[str] = set()
         self.is_killed = self._is_lost = self._is_filming = self._end_asked = False
+        self.ends_itself = True
         group = ReentrantCallbackGroup()
         options: dict[str, Any] = {"callback_group": group}
         self._actions = [
@@ -63,7 +65,7 @@ class FakeRobot(Node):
         if self._is_filming:
             return GoalResponse.REJECT
         self._is_lost = self.is_killed and not self.said
-        self._is_filming, self._end_asked = True, self.is_killed and not self._is_lost
+        self._is_filming, self._end_asked = True, self.is_killed and self.ends_itself and not self._is_lost
         self.said.append(f"survey {goal.survey_id}")
         return GoalResponse.ACCEPT
 

@@ -27,3 +27,19 @@ def test_a_survey_with_a_name_is_asked_for_again_where_nothing_is_heard_of_it(
         assert client.result() == found
         assert robot.said == [f"survey {name}"] * (2 if name else 1)
         client.close()
+
+
+def test_filming_is_ended_once_more_where_the_node_was_killed_before_it_answered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(survey_client, "SILENT_SECONDS", 1.0)
+    with fake_robot() as robot:
+        robot.is_killed, robot.ends_itself = True, False
+        client = SurveyClient(rclpy.create_node("mission"))
+        client.start("monday")
+        with monkeypatch.context() as soon:
+            soon.setattr(survey_client, "ANSWER_SECONDS", 1.0)
+            client.end()
+        assert client.result() == Surveyed(True, "", "/surveys/monday")
+        assert robot.said == ["survey monday", "survey monday", "end"]
+        client.close()
