@@ -26,6 +26,7 @@ from pipeprog_detect.thin.false_lines import is_false_line
 from pipeprog_detect.thin.thin_pipes import find_thin_pipes
 from pipeprog_detect.types import Cloud, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
+from pipeprog_detect.verification.grown_ends import with_grown_ends
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined, own_contours
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
@@ -155,7 +156,7 @@ def detect_outside(
     lost = find_thin_pipes(prepared.points, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
     whole = with_open_ends(joined(measured, judging), around, judging)
-    return _abutted(whole, around, judging)
+    return _abutted(with_grown_ends(whole, judging), around, judging)
 
 
 def _candidates(

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
-from pipeprog_detect.silhouette.extension import CERTAIN, FARTHEST, LEAST, axial_evidence
+from pipeprog_detect.silhouette.extension import CERTAIN, FARTHEST, LEAST, MAX_EXTENSIONS, axial_evidence
 from pipeprog_detect.silhouette.free_space import MIN_VIEWS, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
@@ -39,31 +41,44 @@ def with_open_ends(
 
     def one(number: int) -> MeasuredPipe:
         others = cylinders[:number] + cylinders[number + 1 :]
-        each, cylinder = measured[number], cylinders[number]
-        start, end = (_expected(each, at_end, context, views, others) for at_end in (False, True))
-        longer = Cylinder(cylinder.start - start * cylinder.axis, cylinder.end + end * cylinder.axis, cylinder.radius)
+        each = measured[number]
+        start, end = (_further(each, at_end, context, views, others) for at_end in (False, True))
+        longer = _longer(_longer(each.cylinder, False, start), True, end)
         rims = (0.0 if start else each.rims[0], 0.0 if end else each.rims[1])
         return replace(each, cylinder=longer, rims=rims)
 
     return [one(number) for number in range(len(measured))]
 
 
-def _expected(
+def _further(
     measured: MeasuredPipe, at_end: bool, context: SceneContext, views: Sequence[View], others: Sequence[Cylinder]
 ) -> float:
-    """How far [m] beyond a given end the pipe is expected to end; 0 where that is less than the ends are known to.
-
-    Prior: ends occur as a Poisson process with one end per measured length. The evidence of the contour is added;
-    where something hides the pipe there is none.
-    """
-    cylinder, rim = measured.cylinder, measured.rims[at_end]
+    """How far [m] beyond a given end the pipe is expected to end; 0 where that is less than the ends are known to."""
+    cylinder, rim, further = measured.cylinder, measured.rims[at_end], 0.0
     if rim > CERTAIN:
         return 0.0
-    ahead = _clear(cylinder, at_end, context, views, others)
+    for _ in range(MAX_EXTENSIONS):
+        longer = _longer(cylinder, at_end, further)
+        ahead = _clear(longer, at_end, context, views, others)
+        expected = _expected(longer, at_end, ahead, rim, views, others)
+        if expected < np.inf:
+            further += expected
+            break
+        further, rim = further + ahead, 0.0
+    return further if further > LEAST else 0.0
+
+
+def _expected(
+    cylinder: Cylinder, at_end: bool, ahead: float, rim: float, views: Sequence[View], others: Sequence[Cylinder]
+) -> float:
+    """How far [m] beyond a given end the pipe is expected to end: infinite, if farther than is looked.
+
+    Prior: ends occur as a Poisson process with one end per measured length. The evidence of the contour is added;
+    where something hides the pipe there is none. `rim`: evidence for an end rim at the given end.
+    """
     if ahead < LEAST:
         return 0.0
-    end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
-    looking = views_showing(end + np.linspace(0.0, ahead, 9)[:, None] * out, views, ENOUGH_VIEWS)
+    looking = views_showing(_beyond(cylinder, at_end, np.linspace(0.0, ahead, 9)), views, ENOUGH_VIEWS)
     evidence = axial_evidence(Scene.of(cylinder, looking, others), at_end, ahead)
     if evidence is None:
         return 0.0
@@ -73,8 +88,23 @@ def _expected(
     odds = total[np.searchsorted(evidence.along[beyond], place)] - place / cylinder.length
     odds[0] += rim
     probability = np.exp(odds - odds.max())
-    expected = float(probability @ place / probability.sum())
-    return expected if expected > LEAST else 0.0
+    # Farther than is looked the prior alone is left: its integral is one measured length.
+    is_farther = ahead == _looked_ahead(cylinder) and probability[-1] * cylinder.length > probability.sum() * STEP
+    return np.inf if is_farther else float(probability @ place / probability.sum())
+
+
+def _looked_ahead(cylinder: Cylinder) -> float:
+    return min(cylinder.length, FARTHEST)
+
+
+def _beyond(cylinder: Cylinder, at_end: bool, distance: NDArray[np.floating[Any]]) -> FloatArray:
+    """Points (N, 3) on the axis at a `distance` (N,) [m] beyond an end."""
+    end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
+    return np.asarray(end + distance[:, None] * out, np.float64)
+
+
+def _longer(cylinder: Cylinder, at_end: bool, further: float) -> Cylinder:
+    return cylinder.cut(0.0, cylinder.length + further) if at_end else cylinder.cut(-further, cylinder.length)
 
 
 def _clear(
@@ -85,13 +115,13 @@ def _clear(
     No farther than a plane, another pipe, a stretch through which the views see, or the edge of the images.
     """
     end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
-    ahead = min(cylinder.length, FARTHEST)
+    ahead = _looked_ahead(cylinder)
     for plane in context.planes:
         slope = float(plane.normal @ out)
         distance = float(plane.offset - plane.normal @ end) / slope if abs(slope) > MEETS else ahead
         ahead = min(ahead, distance) if distance > 0.0 else ahead
     place = np.arange(STEP, ahead, STEP)
-    points: FloatArray = end + place[:, None] * out
+    points = _beyond(cylinder, at_end, place)
     shown = np.sum([in_image(view, points) for view in views], axis=0)
     ended = shown < MIN_VIEWS
     for other in others:

@@ -44,6 +44,12 @@ def test_it_lies_before_the_floor_and_before_another_pipe(pipe_views: list[View]
     assert below.end[2] - 1e-3 < height_of_start(pipe.cylinder) < KNOWN
 
 
+def test_an_end_farther_than_a_short_piece_is_looked_ahead_of_is_reached(pipe_views: list[View]) -> None:
+    (whole,) = with_open_ends([measured(cut(0.85 * PIPE.length))], FAR_FLOOR, pipe_views)
+    assert height_of_start(whole.cylinder) == pytest.approx(PIPE.start[2], abs=0.02)
+    np.testing.assert_allclose(whole.cylinder.end, PIPE.end)
+
+
 @pytest.mark.parametrize("rims", [(0.0, 0.0), (2.0 * CERTAIN, 2.0 * CERTAIN)])
 def test_an_end_that_the_views_show_stays(pipe_views: list[View], rims: tuple[float, float]) -> None:
     (whole,) = with_open_ends([measured(PIPE, rims)], FAR_FLOOR, pipe_views)

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ends that a pipe has grown to: cut back where, now that all pipes are known, its contour does not reach there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeprog_detect.silhouette.extension import CERTAIN, LEAST, axial_evidence
+from pipeprog_detect.silhouette.pipe_ends import find_end
+from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+
+
+def with_grown_ends(measured: Sequence[MeasuredPipe], views: Sequence[View]) -> list[MeasuredPipe]:
+    """The pipes without what they have grown by where that is certainly none of theirs.
+
+    A pipe grows piece by piece, each time as far as its last piece tells: a line of the background in line with a side
+    leads it on. All that the contour shows beyond the cloud's cylinder tells together where it ends.
+    """
+    cylinders = [each.cylinder for each in measured]
+
+    def one(number: int) -> MeasuredPipe:
+        others = cylinders[:number] + cylinders[number + 1 :]
+        return _cut(_cut(measured[number], False, views, others), True, views, others)
+
+    return [one(number) for number in range(len(measured))]
+
+
+def _cut(measured: MeasuredPipe, at_end: bool, views: Sequence[View], others: Sequence[Cylinder]) -> MeasuredPipe:
+    """The pipe up to where the evidence beyond the cloud's cylinder is greatest, if it is certainly less at its end."""
+    whole, found = measured.cylinder, measured.candidate.cylinder
+    low, high = np.clip(np.sort(whole.along(np.stack([found.start, found.end]))), 0.0, whole.length).tolist()
+    grown = whole.length - high if at_end else low
+    if grown < LEAST or high - low < LEAST:
+        return measured
+    evidence = axial_evidence(Scene.of(whole.cut(low, high), views, others), at_end, grown)
+    if evidence is None:
+        return measured
+    beyond = evidence.along > 0.0
+    total = np.append(0.0, np.cumsum(evidence.log_odds[beyond]))
+    most = int(np.argmax(total))
+    if total[most] - total[-1] < CERTAIN:
+        return measured
+    place, rim = float(np.append(0.0, evidence.along[beyond])[most]), 0.0
+    end = find_end(Scene.of(_reaching(whole, low, high, at_end, place), views, others), at_end, -place)
+    if end is not None:
+        place, rim = place + end.position, end.odds
+    rims = (measured.rims[0], rim) if at_end else (rim, measured.rims[1])
+    return replace(measured, cylinder=_reaching(whole, low, high, at_end, place), rims=rims)
+
+
+def _reaching(whole: Cylinder, low: float, high: float, at_end: bool, further: float) -> Cylinder:
+    """The pipe to `further` [m] beyond an end of its part from `low` to `high`; its other end stays."""
+    return whole.cut(0.0, high + further) if at_end else whole.cut(low - further, whole.length)

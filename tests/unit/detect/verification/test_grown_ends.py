@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a pipe has grown by stays where its contour is seen, and goes where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.grown_ends import with_grown_ends
+from tests.unit.detect.pipe_and_wall import PIPE
+from tests.unit.detect.verification.test_open_ends import measured
+from tests.unit.detect.verification.test_wall_ends import hiding
+
+FOUND = PIPE.cut(0.4 * PIPE.length, 0.6 * PIPE.length)  # what the cloud shows
+
+
+@pytest.mark.parametrize("further", [0.1, 0.2, 0.4])
+def test_what_is_beyond_the_end_goes(further: float, pipe_views: list[View]) -> None:
+    long = replace(measured(FOUND), cylinder=PIPE.cut(-further, PIPE.length), rims=(3.0, 4.0))
+    (pipe,) = with_grown_ends([long], pipe_views)
+    np.testing.assert_allclose(pipe.cylinder.start, PIPE.start, atol=0.01)
+    np.testing.assert_allclose(pipe.cylinder.end, PIPE.end)
+    assert pipe.rims[1] == 4.0
+    turned = replace(long, cylinder=Cylinder(long.cylinder.end, long.cylinder.start, PIPE.radius))
+    (pipe,) = with_grown_ends([turned], pipe_views)
+    np.testing.assert_allclose(pipe.cylinder.end, PIPE.start, atol=0.01)
+
+
+def test_what_the_contour_shows_stays(pipe_views: list[View]) -> None:
+    whole = replace(measured(FOUND), cylinder=PIPE)
+    assert with_grown_ends([whole], pipe_views) == [whole]
+
+
+def test_what_is_hidden_stays(pipe_views: list[View]) -> None:
+    hider = measured(hiding(-0.6, -0.1)[0])
+    long = replace(measured(FOUND), cylinder=PIPE.cut(-0.2, PIPE.length))
+    assert with_grown_ends([long, hider], pipe_views)[0] is long
+
+
+def test_what_the_cloud_shows_stays(pipe_views: list[View]) -> None:
+    long = measured(PIPE.cut(-0.2, PIPE.length))
+    assert with_grown_ends([long], pipe_views) == [long]
