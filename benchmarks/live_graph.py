@@ -19,6 +19,7 @@ import yaml
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
@@ -134,6 +135,7 @@ class Robot:
         self._chosen = self._answered = 0  # keyframes
         self._is_over, self._shown_at = False, 0.0
         self.feedback: list[Survey.Feedback] = []
+        self._handle: ClientGoalHandle | None = None
         self._node = Node("robot")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -183,6 +185,11 @@ class Robot:
             else:
                 ended = self._has_ended()
 
+    def cancel(self) -> None:
+        """Cancels the survey that runs; its answer tells what became of that."""
+        if self._handle is not None:
+            self._handle.cancel_goal_async()
+
     def _has_ended(self) -> bool:
         """Whether the node has ended filming; a node that dies meanwhile gives no answer."""
         answer = self._end.call_async(Trigger.Request())
@@ -200,7 +207,8 @@ class Robot:
             waited = time.monotonic() + ANSWER
             self.wait_for(lambda sent=sent, waited=waited: sent.done() or time.monotonic() > waited)  # type: ignore[misc]
             if sent.done() and sent.result().accepted:
-                return sent.result().get_result_async()
+                self._handle = sent.result()
+                return self._handle.get_result_async()
         raise RuntimeError(f"the goal {name} was refused {ATTEMPTS} times")
 
     def wait_for(self, condition: Callable[[], object], each: Callable[[], None] = lambda: None) -> None:
