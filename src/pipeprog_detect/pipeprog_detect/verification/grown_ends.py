@@ -21,6 +21,8 @@ def with_grown_ends(measured: Sequence[MeasuredPipe], views: Sequence[View]) -> 
     A pipe grows piece by piece, each time as far as its last piece tells: a line of the background in line with a side
     leads it on. All that the contour shows beyond the cloud's cylinder tells together where it ends.
     """
+    if not views:
+        return list(measured)
     cylinders = [each.cylinder for each in measured]
 
     def one(number: int) -> MeasuredPipe:

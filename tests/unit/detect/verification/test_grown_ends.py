@@ -29,6 +29,11 @@ def test_what_is_beyond_the_end_goes(further: float, pipe_views: list[View]) -> 
     np.testing.assert_allclose(pipe.cylinder.end, PIPE.start, atol=0.01)
 
 
+def test_without_views_all_stays() -> None:
+    long = replace(measured(FOUND), cylinder=PIPE)
+    assert with_grown_ends([long], []) == [long]
+
+
 def test_what_the_contour_shows_stays(pipe_views: list[View]) -> None:
     whole = replace(measured(FOUND), cylinder=PIPE)
     assert with_grown_ends([whole], pipe_views) == [whole]
