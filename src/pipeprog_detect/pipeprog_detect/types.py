@@ -127,6 +127,10 @@ class Cylinder:
         """The part between two positions along the axis, from the start [m]; they may lie beyond the ends."""
         return Cylinder(self.start + low * self.axis, self.start + high * self.axis, self.radius)
 
+    def lengthened(self, at_end: bool, by: float) -> Cylinder:
+        """The cylinder, longer `by` [m] at its end, or at its start; shorter where that is negative."""
+        return self.cut(0.0, self.length + by) if at_end else self.cut(-by, self.length)
+
     def cut_like(self, other: Cylinder) -> Cylinder:
         """The part between the projections of another cylinder's ends on the axis."""
         low, high = sorted(float((end - self.start) @ self.axis) for end in (other.start, other.end))

@@ -83,6 +83,11 @@ class AxialEvidence:
     log_odds: FloatArray
     seen: FloatArray
 
+    def beyond(self) -> tuple[FloatArray, FloatArray]:
+        """Positions (M,) from the end on [m], and the sums (M,) of the log odds up to each: none at the end itself."""
+        outside = self.along > 0.0
+        return np.append(0.0, self.along[outside]), np.append(0.0, np.cumsum(self.log_odds[outside]))
+
 
 def followed(known: AdjustedCylinder, start: Cylinder, prior: FloatArray, held: FloatArray) -> AdjustedCylinder:
     """A pipe of which a piece is known, as long as its contour is seen.

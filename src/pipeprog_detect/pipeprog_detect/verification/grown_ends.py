@@ -42,19 +42,13 @@ def _cut(measured: MeasuredPipe, at_end: bool, views: Sequence[View], others: Se
     evidence = axial_evidence(Scene.of(whole.cut(low, high), views, others), at_end, grown)
     if evidence is None:
         return measured
-    beyond = evidence.along > 0.0
-    total = np.append(0.0, np.cumsum(evidence.log_odds[beyond]))
+    along, total = evidence.beyond()
     most = int(np.argmax(total))
     if total[most] - total[-1] < CERTAIN:
         return measured
-    place, rim = float(np.append(0.0, evidence.along[beyond])[most]), 0.0
-    end = find_end(Scene.of(_reaching(whole, low, high, at_end, place), views, others), at_end, -place)
+    shorter, rim = whole.lengthened(at_end, float(along[most]) - grown), 0.0
+    end = find_end(Scene.of(shorter, views, others), at_end, -float(along[most]))
     if end is not None:
-        place, rim = place + end.position, end.odds
+        shorter, rim = shorter.lengthened(at_end, end.position), end.odds
     rims = (measured.rims[0], rim) if at_end else (rim, measured.rims[1])
-    return replace(measured, cylinder=_reaching(whole, low, high, at_end, place), rims=rims)
-
-
-def _reaching(whole: Cylinder, low: float, high: float, at_end: bool, further: float) -> Cylinder:
-    """The pipe to `further` [m] beyond an end of its part from `low` to `high`; its other end stays."""
-    return whole.cut(0.0, high + further) if at_end else whole.cut(low - further, whole.length)
+    return replace(measured, cylinder=shorter, rims=rims)

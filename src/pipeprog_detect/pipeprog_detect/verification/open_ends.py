@@ -43,7 +43,7 @@ def with_open_ends(
         others = cylinders[:number] + cylinders[number + 1 :]
         each = measured[number]
         start, end = (_further(each, at_end, context, views, others) for at_end in (False, True))
-        longer = _longer(_longer(each.cylinder, False, start), True, end)
+        longer = each.cylinder.lengthened(False, start).lengthened(True, end)
         rims = (0.0 if start else each.rims[0], 0.0 if end else each.rims[1])
         return replace(each, cylinder=longer, rims=rims)
 
@@ -58,7 +58,7 @@ def _further(
     if rim > CERTAIN:
         return 0.0
     for _ in range(MAX_EXTENSIONS):
-        longer = _longer(cylinder, at_end, further)
+        longer = cylinder.lengthened(at_end, further)
         ahead = _clear(longer, at_end, context, views, others)
         expected = _expected(longer, at_end, ahead, rim, views, others)
         if expected < np.inf:
@@ -82,10 +82,9 @@ def _expected(
     evidence = axial_evidence(Scene.of(cylinder, looking, others), at_end, ahead)
     if evidence is None:
         return 0.0
-    beyond = evidence.along > 0.0
-    total = np.append(0.0, np.cumsum(evidence.log_odds[beyond]))
+    along, total = evidence.beyond()
     place = np.arange(0.0, ahead, STEP)
-    odds = total[np.searchsorted(evidence.along[beyond], place)] - place / cylinder.length
+    odds = total[np.searchsorted(along[1:], place)] - place / cylinder.length
     odds[0] += rim
     probability = np.exp(odds - odds.max())
     # Farther than is looked the prior alone is left: its integral is one measured length.
@@ -101,10 +100,6 @@ def _beyond(cylinder: Cylinder, at_end: bool, distance: NDArray[np.floating[Any]
     """Points (N, 3) on the axis at a `distance` (N,) [m] beyond an end."""
     end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
     return np.asarray(end + distance[:, None] * out, np.float64)
-
-
-def _longer(cylinder: Cylinder, at_end: bool, further: float) -> Cylinder:
-    return cylinder.cut(0.0, cylinder.length + further) if at_end else cylinder.cut(-further, cylinder.length)
 
 
 def _clear(
