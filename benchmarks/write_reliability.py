@@ -43,7 +43,7 @@ PLACES = """## Where it runs
 Neither a home folder nor an installation that can be written is needed, nor the rights of root.
 
 Libraries keep files between runs: Numba compiled functions (beside the sources where these can be written, else in `XDG_CACHE_HOME`), Matplotlib a list of fonts (`XDG_CONFIG_HOME`, `XDG_CACHE_HOME`), ROS logs (`ROS_HOME`).
-A variable whose folder cannot be written, or has less than 32 MB left, is set to a private folder `pipeprog-home-*` among the temporary files, by `pipeprog_camera.user_folders`; the next run uses the same one.
+A variable whose folder cannot be written, or has less than 32 MB left, is set to a private folder `pipeprog-home-*` among the temporary files, by `pipeprog_camera.files.user_folders`; the next run uses the same one.
 Compiled functions are programs: a folder there is used only where it belongs to the user and nobody else may write it.
 The first run in it compiles for some minutes.
 

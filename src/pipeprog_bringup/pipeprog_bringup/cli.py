@@ -62,7 +62,7 @@ def main() -> None:
     """Entry point: exit 0 when done, 1 after a clear error, 2 after wrong usage, 130 after Ctrl-C."""
     from pipeprog_bringup.playback.node_processes import NodeFailure
     from pipeprog_camera.errors import InputError
-    from pipeprog_camera.user_folders import provide_user_folders
+    from pipeprog_camera.files.user_folders import provide_user_folders
 
     # As for Ctrl-C, what was started is ended and what was half written is removed.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))

@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
 from pipeprog_camera.outside_text import for_terminal
 
 _NAMED = 3  # of the largest files

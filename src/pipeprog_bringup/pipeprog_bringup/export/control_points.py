@@ -14,10 +14,10 @@ from scipy.special import chdtri
 from pipeprog_bringup.export.survey import Site
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.yaml_file import line_of, read_yaml
 from pipeprog_camera.limits import MAX_CONTROL_POINTS, MAX_COORDINATE
 from pipeprog_camera.outside_text import name_of, nearest, shown
 from pipeprog_camera.similarity import similarity
-from pipeprog_camera.yaml_file import line_of, read_yaml
 
 _KEYS = ("name", "circle", "pixel", "xyz")
 _LEAST = 3  # points fix a rigid transform, where they are not in line

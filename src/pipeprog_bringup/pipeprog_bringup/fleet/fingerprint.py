@@ -12,7 +12,7 @@ from typing import Any
 from pipeprog_bringup.fleet.storage import Mark
 from pipeprog_bringup.fleet.task import Task
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import parse_json
+from pipeprog_camera.files.json_file import parse_json
 
 _BLOCK = 1 << 20  # bytes read at once
 

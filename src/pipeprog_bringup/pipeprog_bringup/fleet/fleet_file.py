@@ -10,8 +10,8 @@ from typing import Any
 from pipeprog_bringup.fleet.recordings import Inputs, Recording, listed
 from pipeprog_bringup.results.setting_overrides import effective
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.yaml_file import line_of, read_yaml
 from pipeprog_camera.outside_text import name_of, nearest, shown
-from pipeprog_camera.yaml_file import line_of, read_yaml
 
 _TOPICS = ("image_topic", "camera_info_topic", "odometry_topic", "imu_topic")
 _SHARED = ("boq", "board", "settings", *_TOPICS)

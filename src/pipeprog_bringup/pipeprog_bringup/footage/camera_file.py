@@ -12,10 +12,10 @@ import numpy as np
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.file_kinds import kind_of
+from pipeprog_camera.files.file_kinds import kind_of
+from pipeprog_camera.files.yaml_file import line_of, read_yaml
 from pipeprog_camera.outside_text import name_of, shown
 from pipeprog_camera.rolling_shutter import check_readout
-from pipeprog_camera.yaml_file import line_of, read_yaml
 
 
 @dataclass(frozen=True)

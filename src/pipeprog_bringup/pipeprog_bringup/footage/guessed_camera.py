@@ -13,8 +13,8 @@ from pipeprog_bringup.footage.video import picture_size
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import read_bytes
 from pipeprog_camera.limits import MAX_ENCODED_IMAGE
-from pipeprog_camera.text_file import read_bytes
 
 FILM_DIAGONAL = 43.27  # mm, of 35 mm film (36 x 24 mm), to which "35 mm equivalent" relates the field of view
 # Relative standard deviation: the length is rounded to a millimetre of 26 (2 %), and video shows a part of the picture.

@@ -21,8 +21,8 @@ from pipeprog_bringup.footage.shot import UNDATED, Excerpt, Shot
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import read_bytes
 from pipeprog_camera.limits import MAX_ENCODED_IMAGE, MAX_POSES
-from pipeprog_camera.text_file import read_bytes
 
 _EXIF, _TAKEN, _FRACTION, _FOCAL_35MM, _ORIENTATION = 0x8769, 0x9003, 0x9291, 0xA405, 0x0112
 _FOCAL_LENGTHS = (8.0, 500.0)  # mm of 35 mm film that a camera can have: from fisheye to tele lenses

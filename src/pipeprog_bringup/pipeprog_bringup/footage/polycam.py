@@ -17,9 +17,9 @@ from pipeprog_bringup.footage import arkit
 from pipeprog_bringup.footage.shot import UNDATED, Excerpt, Shot
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
+from pipeprog_camera.files.text_file import read_bytes
 from pipeprog_camera.limits import MAX_ENCODED_IMAGE, MAX_POSES
-from pipeprog_camera.text_file import read_bytes
 
 _MICROSECOND = 1000  # ns
 _HIGHEST_CONFIDENCE = 255

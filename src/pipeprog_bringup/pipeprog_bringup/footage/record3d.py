@@ -18,7 +18,7 @@ from pipeprog_bringup.footage.shot import UNDATED, Excerpt, Shot
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import parse_json
+from pipeprog_camera.files.json_file import parse_json
 from pipeprog_camera.limits import MAX_ENCODED_IMAGE, MAX_JSON, MAX_POSES, MAX_VIDEO_SECONDS
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, KeyError)

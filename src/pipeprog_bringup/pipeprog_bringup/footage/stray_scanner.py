@@ -18,8 +18,8 @@ from pipeprog_bringup.footage import arkit
 from pipeprog_bringup.footage.shot import Excerpt, Shot
 from pipeprog_bringup.footage.video import Video, picture_size
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import read_bytes, read_text
 from pipeprog_camera.limits import MAX_ENCODED_IMAGE, MAX_POSES, MAX_SECONDS, MAX_TABLE
-from pipeprog_camera.text_file import read_bytes, read_text
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.yaml_file import line_of, read_yaml
 from pipeprog_camera.outside_text import name_of, nearest, shown
-from pipeprog_camera.yaml_file import line_of, read_yaml
 
 MAX_PLACES = 1000  # of a patrol; a night of 12 hours has 700 minutes
 MAX_WORDS = 100  # of a command; programs of this kind take ten arguments

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
 from pipeprog_camera.outside_text import shown
 
 OPEN, FILMING, DONE, FAILED = "open", "filming", "done", "failed"

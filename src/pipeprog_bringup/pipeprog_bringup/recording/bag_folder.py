@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.yaml_file import read_yaml
 from pipeprog_camera.limits import MAX_BAG_PARTS, MAX_METADATA
 from pipeprog_camera.outside_text import nearest, shown
-from pipeprog_camera.yaml_file import read_yaml
 
 _LISTED = 5  # names that an error lists
 _SUFFIXES, _MOST_NAMES = (".mcap", ".db3", ".bag"), 1000  # of recordings beside one that is not there

@@ -17,7 +17,7 @@ from types import TracebackType
 
 from pipeprog_bringup.results.folder_lock import locked
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
 
 _STAGE_PREFIX = ".pipeprog-"
 JOURNAL = "journal"  # folder among the new files that is no result: it is there until these have their names

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
 from pipeprog_camera.limits import MAX_CLASSES, MAX_COORDINATE, MAX_PIPES
 from pipeprog_camera.outside_text import name_of, shown
 

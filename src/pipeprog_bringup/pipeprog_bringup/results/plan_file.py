@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeprog_bringup.results.pipes_file import number, rows_of, vector
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
 from pipeprog_camera.limits import MAX_PIPES
 from pipeprog_camera.outside_text import shown
 from pipeprog_detect.product.boq import PlannedPipe

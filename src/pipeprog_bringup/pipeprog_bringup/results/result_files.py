@@ -22,9 +22,9 @@ from pipeprog_bringup.results import coverage_fields
 from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import read_text
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_TABLE
 from pipeprog_camera.outside_text import for_spreadsheet, shown
-from pipeprog_camera.text_file import read_text
 from pipeprog_detect.coverage.survey import SurveyCoverage
 from pipeprog_detect.product.boq import BillLine, BillOfQuantities, PipeClass
 from pipeprog_detect.product.classification import ClassProgress

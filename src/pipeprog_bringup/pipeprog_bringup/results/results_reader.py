@@ -19,10 +19,10 @@ from pipeprog_bringup.results.pipes_file import read_pipes
 from pipeprog_bringup.results.result_files import read_trajectory
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
+from pipeprog_camera.files.text_file import read_text
+from pipeprog_camera.files.yaml_file import read_yaml
 from pipeprog_camera.limits import MAX_TABLE
-from pipeprog_camera.text_file import read_text
-from pipeprog_camera.yaml_file import read_yaml
 from pipeprog_detect.types import Cylinder
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
 

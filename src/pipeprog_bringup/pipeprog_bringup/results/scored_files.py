@@ -13,8 +13,8 @@ import numpy as np
 from pipeprog_bringup.results.pipes_file import number, rows_of, vector
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.file_kinds import kind_of
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.file_kinds import kind_of
+from pipeprog_camera.files.json_file import read_json
 from pipeprog_camera.limits import MAX_CLASSES, MAX_COORDINATE, MAX_SCORED
 from pipeprog_camera.outside_text import name_of, shown
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import read_text
 from pipeprog_camera.limits import MAX_BILL_COLUMNS, MAX_BILL_ROWS, MAX_TEXT, MAX_YAML
-from pipeprog_camera.text_file import read_text
 from pipeprog_detect.plan.bill_table import heading_row, table_entries
 from pipeprog_detect.plan.entry import Plan
 

@@ -21,9 +21,9 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import require_regular
 from pipeprog_camera.limits import MAX_COORDINATE, MAX_IFC, MAX_NAME, MAX_PIPES
 from pipeprog_camera.outside_text import shown
-from pipeprog_camera.text_file import require_regular
 from pipeprog_detect.plan.entry import LEAST_RADIUS_STEP, Entry, Plan, Segment
 from pipeprog_detect.plan.materials import known_material
 

@@ -11,9 +11,9 @@ from typing import Any
 from xml.etree import ElementTree
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import require_regular
 from pipeprog_camera.limits import MAX_BILL_COLUMNS, MAX_BILL_ROWS, MAX_SHEETS, MAX_XLSX, MAX_XLSX_CONTENT
 from pipeprog_camera.outside_text import shown
-from pipeprog_camera.text_file import require_regular
 from pipeprog_detect.plan.bill_table import Cell, FormulaWithoutValue, heading_row, is_bill, table_entries
 from pipeprog_detect.plan.entry import Plan
 

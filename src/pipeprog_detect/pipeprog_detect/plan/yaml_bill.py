@@ -6,9 +6,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.file_kinds import kind_of
+from pipeprog_camera.files.file_kinds import kind_of
+from pipeprog_camera.files.yaml_file import line_of, read_yaml
 from pipeprog_camera.outside_text import nearest, shown
-from pipeprog_camera.yaml_file import line_of, read_yaml
 from pipeprog_detect.plan.entry import Entry, Plan
 
 

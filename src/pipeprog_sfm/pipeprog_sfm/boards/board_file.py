@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.file_kinds import kind_of
+from pipeprog_camera.files.file_kinds import kind_of
+from pipeprog_camera.files.yaml_file import line_of, read_yaml
 from pipeprog_camera.limits import MAX_BOARD_CIRCLES, MAX_CIRCLES, MAX_KNOWN_DISTANCES, MAX_TARGET_LENGTH
 from pipeprog_camera.outside_text import name_of, nearest, shown
-from pipeprog_camera.yaml_file import line_of, read_yaml
 from pipeprog_sfm.boards.board import MIN_CIRCLES, Board, symmetries
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.json_file import read_json
+from pipeprog_camera.files.json_file import read_json
 
 
 def test_an_object_is_read(tmp_path: Path) -> None:

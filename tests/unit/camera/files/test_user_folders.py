@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeprog_camera import user_folders
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.user_folders import provide_user_folders
+from pipeprog_camera.files import user_folders
+from pipeprog_camera.files.user_folders import provide_user_folders
 
 VARIABLES = {"XDG_CACHE_HOME": ".cache", "XDG_CONFIG_HOME": ".config", "ROS_HOME": ".ros"}
 

@@ -15,9 +15,9 @@ from typing import Any
 import yaml
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import read_text
 from pipeprog_camera.limits import MAX_DEPTH, MAX_DIGITS, MAX_NODES, MAX_TEXT, MAX_YAML
 from pipeprog_camera.outside_text import shown
-from pipeprog_camera.text_file import read_text
 
 _PREFIX = "tag:yaml.org,2002:"
 _NUMBERS = (f"{_PREFIX}int", f"{_PREFIX}float")

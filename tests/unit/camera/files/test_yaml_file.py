@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.yaml_file import line_of, parse_yaml, read_yaml
 from pipeprog_camera.limits import MAX_DEPTH, MAX_DIGITS, MAX_NODES, MAX_TEXT, MAX_YAML
-from pipeprog_camera.yaml_file import line_of, parse_yaml, read_yaml
 
 
 def laughs(levels: int, width: int = 9) -> str:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.files.text_file import read_text
 from pipeprog_camera.limits import MAX_DIGITS, MAX_JSON
 from pipeprog_camera.outside_text import shown
-from pipeprog_camera.text_file import read_text
 
 
 def read_json(path: str | Path, most: int = MAX_JSON) -> dict[str, Any]:
