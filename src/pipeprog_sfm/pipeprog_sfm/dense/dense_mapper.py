@@ -6,14 +6,13 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
@@ -30,21 +29,19 @@ from pipeprog_sfm.dense.stereo import (
     working_size,
 )
 from pipeprog_sfm.types import EncodedImage
+from pipeprog_sfm.view_overlap import in_image, sample, view_overlap
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
 SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits for no more than these
 PICTURES = 12  # of keyframes at working resolution, 11 MB each at 720p: neighbours are mostly the last few
 NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
-SAMPLE = 200  # points of a keyframe from which its overlap with others is estimated, to 0.04
-SAME_SIDE = np.radians(8.0)  # between rays to a point; beyond (baseline 0.14 of the depth) a view adds information
 # A keyframe of which the newest one sees less than this share is left behind: no nearer one comes any more.
 LEFT_BEHIND = 0.5
 # Share of a keyframe's points that too few depth maps show, from which on it gets its own: that is what the margins of
 # a swaying image show. The sample of its points tells it with a standard deviation of 0.014.
 MARGIN = 0.04
 STILL = RowMotion(0.0, 1, np.zeros(3), np.zeros(3))  # all rows at the stamp, however many there are
-SAME_SCALE = 1.5  # ratio of depths; a view that is nearer by more shows more detail
 
 
 @dataclass(frozen=True)
@@ -184,7 +181,7 @@ class DenseMapper:
             self._refused[stamp] = len(keyframes)
             return
         mapped = [other for other in self._depths if other in keyframes]
-        seen = overlap(_sample(points), keyframes.poses[stamp], [keyframes.view(other) for other in mapped])
+        seen = view_overlap(sample(points), keyframes.poses[stamp], [keyframes.view(other) for other in mapped])
         if len(seen) and seen.max() > self._overlap:
             self._covered[stamp] = mapped[int(seen.argmax())]
             self._unsettled.append(stamp)
@@ -200,13 +197,13 @@ class DenseMapper:
             stamp = self._unsettled[0]
             if stamp in self._covered and stamp in keyframes:
                 points = keyframes.in_front(stamp)
-                sample = _sample(points)
+                own = sample(points)
                 newest = keyframes.view(max(keyframes.poses))
-                if not complete and in_image(sample, [newest]).mean() > LEFT_BEHIND:
+                if not complete and in_image(own, [newest]).mean() > LEFT_BEHIND:
                     return
                 mapped = [keyframes.view(other) for other in self._depths if other in keyframes]
-                missed = in_image(sample, mapped).sum(axis=0) < self._fusion_config.min_views
-                if missed.sum() > MARGIN * len(sample):
+                missed = in_image(own, mapped).sum(axis=0) < self._fusion_config.min_views
+                if missed.sum() > MARGIN * len(own):
                     del self._covered[stamp]
                     self._start(stamp, keyframes, points)
             self._unsettled.popleft()
@@ -284,40 +281,6 @@ class DenseMapper:
         return self._fusion.cloud()
 
 
-def overlap(
-    points: FloatArray, camera_from_model: FloatArray, others: Sequence[tuple[FloatArray, Camera]]
-) -> FloatArray:
-    """(V,) share of the (K, 3) points of one view that each of the others sees from the same side and distance.
-
-    others: (4, 4) camera_from_model and calibration of each.
-    """
-    if not others:
-        return np.zeros(0)
-    poses = np.stack([camera_from_model, *(pose for pose, _ in others)])
-    depth = points @ poses[:, 2, :3].T + poses[:, 2, 3]
-    rays = points - -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])[:, None]
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    seen = in_image(points, others)
-    seen &= (np.einsum("vki,ki->vk", rays, rays[0]) > np.cos(SAME_SIDE))[1:]
-    seen &= depth.T[1:] < SAME_SCALE * depth.T[0]
-    return np.asarray(seen.mean(axis=1), np.float64)
-
-
-def in_image(points: FloatArray, views: Sequence[tuple[FloatArray, Camera]]) -> NDArray[np.bool_]:
-    """(V, K) whether views, each a (4, 4) camera_from_model and a calibration, show the (K, 3) points."""
-    if not views:
-        return np.zeros((0, len(points)), bool)
-    poses = np.stack([pose for pose, _ in views])
-    inside = np.einsum("vij,kj->vki", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-    cameras = [(each.fx, each.fy, each.cx, each.cy, each.width, each.height) for _, each in views]
-    fx, fy, cx, cy, width, height = np.array(cameras, float).T[..., None]
-    depth = inside[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = inside[..., 0] / depth * fx + cx
-        v = inside[..., 1] / depth * fy + cy
-    return np.asarray((depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
-
-
 def distance(camera_from_world: FloatArray, other_from_world: FloatArray) -> float:
     """Between the projection centres of two (4, 4) poses."""
     return float(np.linalg.norm(centre(camera_from_world) - centre(other_from_world)))
@@ -326,11 +289,6 @@ def distance(camera_from_world: FloatArray, other_from_world: FloatArray) -> flo
 def centre(camera_from_world: FloatArray) -> FloatArray:
     """(3,) projection centre of a (4, 4) pose."""
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
-
-
-def _sample(points: FloatArray) -> FloatArray:
-    """Some of (K, 3) points, from all over the image."""
-    return points[:: max(len(points) // SAMPLE, 1)]
 
 
 def _picture(image: EncodedImage, width: int) -> Picture:
