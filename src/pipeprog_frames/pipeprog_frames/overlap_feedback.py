@@ -30,6 +30,7 @@ class OverlapReport:
         cell_overlap: the same counted in cells of the image, which a single wrong feature cannot change.
         matches_previous: matches with the keyframe before it.
         matches_next: matches with the keyframe after it.
+        place_overlap: share of what it shows that each of three keyframes of earlier visits shows from the same side.
     """
 
     stamp: int
@@ -38,6 +39,7 @@ class OverlapReport:
     cell_overlap: float
     matches_previous: int
     matches_next: int
+    place_overlap: float = 0.0
 
 
 @dataclass
@@ -45,7 +47,7 @@ class _Keyframe:
     stamp: int
     overlap: float  # predicted, with the keyframe before it
     parallax: float  # in the unit of parallax_max
-    fixed: bool = False  # added by feedback: never retired
+    fixed: bool = False  # added by feedback: never thinned out
     report: OverlapReport | None = None
     bridges: int = 0
     overlap_when_helped: float = -1.0
@@ -58,13 +60,14 @@ class StreamFeedback:
     of its image, the second one triangulates it. It gets a frame beside it where the smaller of its two overlaps is
     below `overlap_min`. In groups of more than three above `overlap_max`, every second one is retired where its
     neighbours still overlap by `overlap_min` with a parallax below `parallax_max` (in the unit of the
-    decisions that are noted).
+    decisions that are noted). One is retired, too, where keyframes of earlier visits show the same by more than
+    `overlap_max`: what is kept grows with the site, not with the time spent there.
 
-    This terminates: a frame that was added is never retired, and a retired one is never added again.
+    This terminates: a frame that was added is never thinned out, and a retired one is never added again.
 
     Attributes:
         max_gap: ns. Two keyframes that are farther apart in time get a frame between them, and none is retired whose
-            neighbours are; None: no matter how far.
+            neighbours are, or for an earlier visit; None: no matter how far.
     """
 
     def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, best_between: BestBetween) -> None:
@@ -91,7 +94,7 @@ class StreamFeedback:
         for report in reports:
             if report.stamp in self._keyframes:
                 self._keyframes[report.stamp].report = report
-        decisions: list[Decision] = []
+        decisions = self._leave_known_places(complete)
         for stamp in list(self._stamps):
             if self._is_judged(stamp, complete):
                 decisions += self._add_beside(stamp)
@@ -191,7 +194,25 @@ class StreamFeedback:
         if not (overlap >= self._overlap_min and parallax <= self._parallax_max):  # NaN: not known, so it stays
             return []
         following.overlap, following.parallax = overlap, parallax
+        return [self._forget(stamp, "retired: its neighbours overlap without it")]
+
+    def _leave_known_places(self, complete: bool) -> list[Decision]:
+        """Retires keyframes that show what those of earlier visits show."""
+        if self.max_gap is not None:
+            return []
+        decisions = []
+        for stamp in list(self._stamps):
+            report = self._keyframes[stamp].report
+            if not self._is_judged(stamp, complete) or report is None or report.place_overlap <= self._overlap_max:
+                continue
+            _, after = self._neighbours(stamp)
+            if after is not None:  # how much it overlaps with the one before it is not known any more
+                self._keyframes[after].overlap = self._keyframes[after].parallax = float("nan")
+            decisions.append(self._forget(stamp, "retired: its place was seen before"))
+        return decisions
+
+    def _forget(self, stamp: int, reason: str) -> Decision:
+        keyframe = self._keyframes.pop(stamp)
         self._stamps.remove(stamp)
-        del self._keyframes[stamp]
         self._retired.add(stamp)
-        return [Decision(stamp, False, "retired: its neighbours overlap without it", keyframe.overlap)]
+        return Decision(stamp, False, reason, keyframe.overlap)

@@ -38,10 +38,10 @@ from pipeprog_node.journal import Journal, journal_of
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
-from pipeprog_node.received import keyframes as received_keyframes
 from pipeprog_node.received import motion as received_motion
 from pipeprog_node.received.keyframes import ReceivedRetirement
 from pipeprog_node.received.motion import ReceivedAcceleration, ReceivedTransform, ReceivedTransforms
+from pipeprog_node.retirement_input import RetirementInput
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.alignment.map_file import read_map
@@ -63,7 +63,6 @@ from pipeprog_sfm.worker import (
     serve,
 )
 
-RETIRED = "keyframes/retired"
 MAX_BACKLOG = 50  # commands that wait for the process; as deep as the keyframes' topic
 STATUS_PERIOD = 0.2  # s, at most, from a message of motion to the status that counts it
 WAKE_PERIOD = 1.0  # s between two looks whether a reconstruction that died too often is to be started again
@@ -191,6 +190,7 @@ class MapOutput:
                 features=report.features,
                 matches_previous=report.matches_previous,
                 matches_next=report.matches_next,
+                place_overlap=report.place_overlap,
             )
             for report in reports
         ]
@@ -293,17 +293,15 @@ class SfmNode(Node):
         self._motion = MotionInput(self._intake, self._lockstep, ignored=FRAME if publish_tf else None)
         self._status = Status()
         self._motion_published = 0  # messages of motion that the last status counts
-        self._retirements: list[ReceivedRetirement] = []  # to be applied after the keyframes before them
         self._retiring: deque[ReceivedRetirement] = deque()  # at the worker
         self._seen = self._last_stamp = 0
         self._camera_frame = ""  # of the newest keyframe
         self._finish_sent = False
-        # With a journal, what was published may come again.
-        self._known_retirements: set[tuple[int, ...]] | None = None if journal is None else set()
-        known = None if journal is None else self._take_up(journal)
+        self._is_journalled = journal is not None
+        known, retired = (None, None) if journal is None else self._take_up(journal)
         self._keyframes = KeyframeInput(self._intake, self._on_keyframe, known=known)
-        depth = qos.reliable(MAX_BACKLOG) if journal is None else qos.kept(MAX_BACKLOG)
-        self._intake.subscribe(msg.KeyframesRetired, RETIRED, received_keyframes.retirement, self._on_retired, depth)
+        self._retirements = RetirementInput(self._intake, self._retire, known=retired)
+        self._retirements.keyframes_came(self._seen)
         self._finish = FinishService(self, lambda: self._seen, self._begin_finish)
         self._diagnostics = Diagnostics(self, "reconstruction", self._health)
         # Wall time: the status must follow while a paused recording stops ROS time.
@@ -316,8 +314,8 @@ class SfmNode(Node):
         self._supervision.close()
         super().destroy_node()
 
-    def _take_up(self, journal: Journal) -> list[int]:
-        """Counts what is in the journal as it was counted before; returns the stamps of the keyframes in it."""
+    def _take_up(self, journal: Journal) -> tuple[list[int], list[tuple[int, ...]]]:
+        """Counts what is in the journal as before; returns the stamps of the keyframes and retirements in it."""
         known, retired = [], []
         for number, command in journal.commands():
             is_answered = number not in journal.waiting
@@ -330,11 +328,10 @@ class SfmNode(Node):
             self._retired += is_answered
             if not is_answered:
                 self._retiring.append(ReceivedRetirement(max(command.stamps), self._camera_frame, 0, command.stamps))
-        self._known_retirements = set(retired)
         if journal.note is not None:
             self._dropped, self._output.revision, self._output.newest_stamp = journal.note
         self._seen, self._last_stamp = len(known) + self._dropped, max(known, default=0)
-        return known
+        return known, retired
 
     def _note(self) -> None:
         """Keeps what the commands do not tell for a process that takes this one's place."""
@@ -352,27 +349,12 @@ class SfmNode(Node):
             self._note()
         else:
             self._supervision.send(replace(keyframe, motion=self._motion.take()))
-        self._retire_when_due()
+        self._retirements.keyframes_came(self._seen)
         self._finish_when_complete()
 
-    def _on_retired(self, retirement: ReceivedRetirement) -> None:
-        if self._known_retirements is not None:
-            if retirement.stamps in self._known_retirements:
-                return
-            self._known_retirements.add(retirement.stamps)
-        self._retirements.append(retirement)
-        self._retire_when_due()
-        if len(self._retirements) > MAX_BACKLOG:
-            last = max(self._retirements, key=lambda each: each.keyframes_published)
-            self._retirements.remove(last)
-            text = f"{MAX_BACKLOG} retirements wait already, that after {last.keyframes_published} keyframes is dropped"
-            self._intake.reject(RETIRED, InvalidMessageError("waiting", text))
-
-    def _retire_when_due(self) -> None:
-        for retirement in [each for each in self._retirements if self._seen >= each.keyframes_published]:
-            self._retirements.remove(retirement)
-            self._retiring.append(retirement)
-            self._supervision.send(Retire(retirement.stamps))
+    def _retire(self, retirement: ReceivedRetirement) -> None:
+        self._retiring.append(retirement)
+        self._supervision.send(Retire(retirement.stamps))
 
     def _begin_finish(self) -> None:
         self._finish_sent = False
@@ -393,7 +375,7 @@ class SfmNode(Node):
         if isinstance(event, Ready):
             self._supervision.ready()
             # Answers may have been lost with a process before this one.
-            if self._known_retirements is not None and self._done:
+            if self._is_journalled and self._done:
                 self._publish_overlap((), messages.header(self._last_stamp, self._camera_frame))
             return
         self._status = event.status

@@ -35,6 +35,7 @@ class ReceivedOverlap:
     cell_overlap: float
     matches_previous: int
     matches_next: int
+    place_overlap: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def image_overlaps(message: ImageOverlapArray) -> ReceivedOverlaps:
 
 
 def _overlap(image: ImageOverlap) -> ReceivedOverlap:
-    for value in (image.overlap, image.cell_overlap):
+    for value in (image.overlap, image.cell_overlap, image.place_overlap):
         if not 0.0 <= value <= MAX_OVERLAP:  # false for NaN
             raise InvalidMessageError("overlap", f"an overlap of {value:g}: it is a share of the image, from 0 to 1")
     return ReceivedOverlap(
@@ -89,4 +90,5 @@ def _overlap(image: ImageOverlap) -> ReceivedOverlap:
         image.cell_overlap,
         image.matches_previous,
         image.matches_next,
+        image.place_overlap,
     )

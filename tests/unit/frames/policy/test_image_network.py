@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -220,6 +220,41 @@ def test_no_keyframe_is_retired_whose_neighbours_are_too_far_apart_in_time() -> 
     feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between)
     feedback.max_gap = 9 * PERIOD
     assert play(feedback, walk, dense)[0] == set(dense)
+
+
+def with_places(walk: Walk, images: Collection[int], reports: list[OverlapReport]) -> list[OverlapReport]:
+    """The reports with what three images of earlier visits, more than eight before them, show of the same."""
+    place = [walk.place[(stamp - 1) // PERIOD] for stamp in sorted(images)]
+    shares = [sorted(1.0 - abs(place[k] - other) for other in place[: max(k - 8, 0)]) for k in range(len(place))]
+    return [
+        replace(report, place_overlap=share[-3] if len(share) > 2 else 0.0)
+        for report, share in zip(reports, shares, strict=True)
+    ]
+
+
+def test_what_is_kept_grows_with_the_site_and_not_with_the_visits() -> None:
+    there = steady(10.0, 0.3).place
+    walk = Walk(np.concatenate([there, there[::-1]] * 4))
+    chosen = walk.stamps[::13]
+
+    def kept(place_known: bool, max_gap: int | None = None) -> list[int]:
+        feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between)
+        feedback.max_gap = max_gap
+        images: set[int] = set()
+        for stamp in chosen:
+            feedback.chosen(Decision(stamp, True, "", 0.87, 13.0))
+            images.add(stamp)
+            reports = walk.reports(images)
+            for decision in feedback.answer(with_places(walk, images, reports) if place_known else reports):
+                images.symmetric_difference_update([decision.stamp])
+        return sorted(images)
+
+    everything, known = kept(False), kept(True)
+    first = [stamp for stamp in known if stamp <= len(there) * PERIOD]
+    assert len(known) < 0.45 * len(everything)
+    assert len([stamp for stamp in known if stamp > 4 * len(there) * PERIOD]) <= 4  # the newest ones
+    assert np.diff(walk.place[[(stamp - 1) // PERIOD for stamp in first]]).max() < 0.15
+    assert len(kept(True, 60 * PERIOD)) > len(known), "velocities of a rolling shutter need the neighbours in time"
 
 
 @settings(max_examples=25, deadline=None)

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import CAMERA, STEP
+from scenes import BASE, CAMERA, STEP, pose, view
 
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe, hull_area
 from pipeprog_sfm.features.sift import Features
-from pipeprog_sfm.sparse.overlap import OverlapTracker
+from pipeprog_sfm.sparse.overlap import OverlapTracker, place_overlap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 
@@ -74,3 +74,37 @@ def test_it_is_told_again_when_it_changes_and_when_it_was_forgotten() -> None:
     assert len(overlaps.changed({0: one}, model)) == 1
     model.add_view(0, one.rays, one.focal, np.eye(4))
     assert [tie.registered for tie in overlaps.changed({0: one}, model)] == [True]
+
+
+def visits(*places: float) -> tuple[SparseModel, dict[int, Keyframe]]:
+    """Views from these places of the walk along the corner, and the points that they see, all true."""
+    model, keyframes = SparseModel(), {}
+    for number, place in enumerate(places):
+        seen = Keyframe.of(STEP * number, view(pose(BASE * place), 7), CAMERA)
+        keyframes[seen.stamp] = seen
+        model.add_view(seen.stamp, seen.rays, seen.focal, pose(BASE * place))
+    wall = np.c_[np.linspace(-2, 6, 4000), np.zeros(4000), np.full(4000, 2.0)]
+    model.points = wall
+    for each in range(len(places)):
+        inside = wall @ model.rotation[each].T + model.translation[each]
+        shown = np.flatnonzero(np.abs(inside[:, 0] / inside[:, 2]) < 639 / 900)[: len(keyframes[STEP * each].rays)]
+        model.point_of[model.features(each)][: len(shown)] = shown
+    return model, keyframes
+
+
+def test_a_place_was_seen_by_keyframes_of_an_earlier_visit_and_not_by_later_ones() -> None:
+    model, keyframes = visits(*range(5), *range(14), 3.2)
+    others = [0.2, 0.2, 0.8]  # of 3 and 4, which both visits have
+    shown = [1 - shift * BASE / (2 * 1280 / 900) for shift in others]
+    assert place_overlap(model, 19, keyframes) == pytest.approx(min(shown), abs=0.02)
+    assert [place_overlap(model, each, keyframes) for each in range(5)] == [0.0] * 5
+
+
+def test_neighbours_in_time_and_views_that_nothing_ties_are_no_earlier_visit() -> None:
+    model, keyframes = visits(*range(5), 3.2)
+    assert place_overlap(model, 5, keyframes) == 0.0
+    model, keyframes = visits(*range(5), *range(14), 3.2)
+    last = model.features(19)
+    model.points = np.concatenate([model.points, model.points])  # the same points, not yet known to be the same
+    model.point_of[last] += np.where(model.point_of[last] >= 0, 4000, 0)
+    assert place_overlap(model, 19, keyframes) == 0.0
