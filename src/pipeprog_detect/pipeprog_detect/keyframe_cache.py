@@ -43,8 +43,9 @@ class Keyframes:
         return bool(others)
 
     def remove(self, stamp: int) -> None:
-        """Forgets a keyframe."""
-        del self._encoded[stamp]
+        """Forgets a keyframe; one that is not known is ignored."""
+        self._encoded.pop(stamp, None)
+        self._images.pop(stamp, None)
 
     def is_decoded(self, stamp: int) -> bool:
         """Whether `view` has the image at hand."""

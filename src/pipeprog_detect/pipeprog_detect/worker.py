@@ -41,6 +41,14 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
+class Retire:
+    """Command: forget these keyframes, no map contains them any more; those that are not known are ignored."""
+
+    stamps: tuple[int, ...]
+    content: None = None  # nothing of it is to be recognised when it comes again
+
+
+@dataclass(frozen=True)
 class Map:
     """Command: detect in this map; poses (M, 4, 4) map_from_camera and velocities belong to stamps (M,).
 
@@ -107,18 +115,18 @@ def serve(
     connection: Connection,
     config: DetectConfig,
     boq: BillOfQuantities,
-    kept: Iterable[Keyframe],
+    kept: Iterable[Keyframe | Retire],
     named: Mapping[str, Cylinder],
 ) -> None:
-    """Works off commands from `connection` until it closes; a predecessor had these keyframes and gave these names."""
+    """Works off commands from `connection` until it closes; a predecessor `kept` these and gave these names."""
     keyframes, identities, memory = Keyframes(), PipeTracker(named), MeasurementCache()
-    for keyframe in kept:
-        keyframes.add(keyframe.stamp, keyframe.encoded, keyframe.camera)
+    for earlier in kept:
+        _keep(earlier, keyframes, memory)
     connection.send(Ready())
     while True:
         command = connection.recv()
-        if isinstance(command, Keyframe):
-            keyframes.add(command.stamp, command.encoded, command.camera)
+        if not isinstance(command, Map):
+            _keep(command, keyframes, memory)
             continue
         if command.camera is not None and keyframes.replace_camera(command.camera):
             memory = MeasurementCache()
@@ -139,6 +147,15 @@ def serve(
         if not command.final:
             pipes = identities.named(pipes)
         connection.send(PipesReady(command.revision, product_of(pipes, boq)))
+
+
+def _keep(command: Keyframe | Retire, keyframes: Keyframes, memory: MeasurementCache) -> None:
+    if isinstance(command, Keyframe):
+        keyframes.add(command.stamp, command.encoded, command.camera)
+        return
+    for stamp in command.stamps:
+        keyframes.remove(stamp)
+    memory.forget_views(command.stamps)
 
 
 def _views(connection: Connection, command: Map, keyframes: Keyframes) -> Iterator[View]:

@@ -300,6 +300,29 @@ def test_keyframes_that_are_no_images_are_left_out(stage: Callable[..., Stage]) 
     assert scene.values()["keyframes left out"] == str(len(broken))
 
 
+def test_a_retired_keyframe_is_forgotten_and_may_come_again(stage: Callable[..., Stage]) -> None:
+    scene = stage()
+    retired = scene.others.create_publisher(msg.KeyframesRetired, "keyframes/retired", qos.reliable(50))
+    scene.spin_until(retired.get_subscription_count)
+    again = msg.KeyframesRetired(
+        header=messages.header(START, "camera"), keyframes_published=2, stamps=[messages.time_msg(START)]
+    )
+    retired.publish(again)  # for two keyframes, of which none has come
+    for stamp, encoded in ((START, JPEG[:400]), (START + STEP, JPEG)):
+        scene.send_image(stamp, encoded)
+        scene.send_calibration(stamp)
+    scene.spin_until(lambda: scene.values()["keyframes retired"] == "1")
+    scene.send_map(START, 1, [START, START + STEP], corner())
+    scene.spin_until(lambda: scene.pipes)
+    assert scene.values()["keyframes left out"] == "0"  # it was not decoded
+    scene.send_image(START)
+    scene.send_calibration(START)
+    scene.send_map(START + STEP, 2, [START, START + STEP], corner())
+    scene.spin_until(lambda: len(scene.pipes) > 1)
+    values = scene.values()
+    assert (values["keyframes"], values[""]) == ("2", "detecting")
+
+
 def test_an_image_that_never_comes_is_not_waited_for_for_ever(stage: Callable[..., Stage]) -> None:
     scene = stage()
     scene.send_map(START, 1, [START], corner())

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,6 +89,10 @@ class MeasurementCache:
     def next_map(self) -> None:
         """Forgets what only the map before the last one needed."""
         self._last, self._current = self._current, []
+
+    def forget_views(self, stamps: Collection[int]) -> None:
+        """Forgets what was measured in single keyframes that no map contains any more."""
+        self.edges = {key: found for key, found in self.edges.items() if key[0] not in stamps}
 
     def recall(self, question: Question) -> tuple[bool, ContourFit | None]:
         """Whether the last map answers the question, and the fit (None: there is none)."""
