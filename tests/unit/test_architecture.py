@@ -41,8 +41,10 @@ GLUE = {
         "main",
         *{"header", "images", "keyframes", "maps", "motion"},  # the room received
         "renewal",
+        "retirement_input",
         "worker",
     },
+    "pipeprog_detect": {"map_input", "pipe_output"},
     "pipeprog_bringup": {
         *{"replay", "session", "connections", "player", "listener", "survey_writer", "outline_marker"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},
@@ -155,7 +157,7 @@ def ids(path: Path) -> str:
 def knows_ros(path: Path) -> bool:
     """Whether a module may use ROS: the node of a core, and the glue."""
     package = owner(path)
-    return (package in CORES and path.stem == "node") or path.stem in GLUE.get(package, ())
+    return (package in CORES and path.stem == "node") or path.stem in GLUE.get(package, set())
 
 
 @pytest.mark.parametrize("path", MODULES, ids=ids)

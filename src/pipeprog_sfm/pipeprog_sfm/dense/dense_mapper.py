@@ -18,6 +18,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
+from pipeprog_camera.view_overlap import in_image, sample, view_overlap
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
 from pipeprog_sfm.dense.stereo import (
@@ -29,7 +30,6 @@ from pipeprog_sfm.dense.stereo import (
     working_size,
 )
 from pipeprog_sfm.types import EncodedImage
-from pipeprog_sfm.view_overlap import in_image, sample, view_overlap
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
 SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits for no more than these

@@ -12,7 +12,6 @@ from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense import dense_mapper
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, Registered
 from pipeprog_sfm.types import EncodedImage
-from pipeprog_sfm.view_overlap import view_overlap
 
 WIDTH, HEIGHT = 240, 160
 CAMERA = Camera(WIDTH, HEIGHT, 220.0, 220.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -126,18 +125,3 @@ def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
     dense.update(Registered(left, images, lambda other: seen(left[other])), complete=True)
     assert len(dense) > after
     assert len(dense.fuse(left, left, 1.0, complete=True, anew=True).result().points) > 1000
-
-
-def test_overlap_is_the_share_seen_from_the_same_side() -> None:
-    points = seen(pose(4))
-    turned = pose(4)
-    turned[:3, :3] = cv2.Rodrigues(np.array([0.0, np.pi, 0.0]))[0]
-    nearer = pose(4)
-    nearer[2, 3] = 0.5  # farther away: all of it, but smaller
-    share = view_overlap(points, pose(4), [(other, CAMERA) for other in (pose(4), pose(5), pose(12), turned, nearer)])
-    assert share[0] == 1.0
-    assert share[1] == pytest.approx(1 - STEP / WIDTH, abs=0.03)
-    assert share[2] == 0.0  # 31 degrees round
-    assert share[3] == 0.0
-    assert share[4] < 1.0
-    assert len(view_overlap(points, pose(4), [])) == 0
