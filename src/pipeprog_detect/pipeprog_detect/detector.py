@@ -31,6 +31,7 @@ from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined, own_contours
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.open_ends import with_open_ends
+from pipeprog_detect.verification.parallel_to_wall import parallel_to_wall
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import with_ends_on_walls
 
@@ -155,6 +156,7 @@ def detect_outside(
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(prepared.points, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
+    measured = [parallel_to_wall(each, around) for each in measured]
     whole = with_open_ends(joined(measured, judging), around, judging)
     return _abutted(with_grown_ends(whole, judging), around, judging)
 

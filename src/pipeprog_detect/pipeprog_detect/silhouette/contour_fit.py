@@ -22,8 +22,9 @@ class ContourFit:
 
     Attributes:
         cylinder: the cylinder.
-        covariance: (5, 5) of the axis' offset at its middle (2) [m], its direction (2) [rad] and the radius [m]; the
-            directions are across the axis, sideways as the views see it and away from them.
+        across: (2, 3) unit vectors across the axis, sideways as the views see it and away from them.
+        covariance: (5, 5) of the axis' offset at its middle (2) [m], its direction (2) [rad] and the radius [m], both
+            along `across`.
         radius_sigma: standard deviation of the radius [m].
         support: share (0 to 1) of the visible contour with an edge in three views or more.
         log_odds: logarithm of how much more probable its edges are on a pipe there than on texture.
@@ -35,6 +36,7 @@ class ContourFit:
     """
 
     cylinder: Cylinder
+    across: FloatArray
     covariance: FloatArray
     radius_sigma: float
     support: float
@@ -49,21 +51,23 @@ def contour_fit(found: AdjustedCylinder, ends: tuple[End | None, End | None]) ->
     """The adjusted cylinder between its `ends` (None: as it is), with what is known of its errors."""
     cylinder = found.cylinder
     length, axis = cylinder.length, cylinder.axis
-    from_ends = np.zeros((5, 5))
-    from_ends[0:2, 0:2] = from_ends[0:2, 2:4] = 0.5 * np.eye(2)
-    from_ends[2:4, 0:2] = -np.eye(2) / length
-    from_ends[2:4, 2:4] = np.eye(2) / length
-    from_ends[4, 4] = 1.0
-    systematic = np.hypot(MODEL_ERROR, CLUTTER_ERROR * (1.0 - found.share)) / float(np.median(found.samples.gain))
-    covariance = from_ends @ (found.covariance + systematic**2 * np.eye(5)) @ from_ends.T
     start, end = ends
     measured = Cylinder(
         cylinder.start - (start.position if start else 0.0) * axis,
         cylinder.end + (end.position if end else 0.0) * axis,
         cylinder.radius,
     )
+    middle = float(cylinder.along(measured.middle[None])[0]) / length  # share of the way from start to end
+    from_ends = np.zeros((5, 5))
+    from_ends[0:2, 0:2], from_ends[0:2, 2:4] = (1.0 - middle) * np.eye(2), middle * np.eye(2)
+    from_ends[2:4, 0:2] = -np.eye(2) / length
+    from_ends[2:4, 2:4] = np.eye(2) / length
+    from_ends[4, 4] = 1.0
+    systematic = np.hypot(MODEL_ERROR, CLUTTER_ERROR * (1.0 - found.share)) / float(np.median(found.samples.gain))
+    covariance = from_ends @ (found.covariance + systematic**2 * np.eye(5)) @ from_ends.T
     return ContourFit(
         measured,
+        found.scene.basis,
         covariance,
         float(np.sqrt(covariance[4, 4])),
         found.share,

@@ -86,7 +86,7 @@ def find_thin_pipes(
             return
         if is_false_line(fit.cylinder, some, views, known):
             return
-        thin.append(MeasuredPipe(_as_candidate(fit, lines.points), fit.cylinder, fit.radius_sigma, fit.rims))
+        thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
         known.append(fit.cylinder)
 
     seen = pair_views(views, some, radii, known, edges)

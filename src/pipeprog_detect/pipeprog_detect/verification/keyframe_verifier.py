@@ -127,7 +127,7 @@ class KeyframeVerifier:
             return MeasuredPipe.of_cloud(candidate)
         if not self._fitter.is_planned(fit) and contradict(candidate, fit):
             return MeasuredPipe.between_ends_of(candidate, fit)
-        return MeasuredPipe(candidate, fit.cylinder, fit.radius_sigma, fit.rims)
+        return MeasuredPipe.of_contour(candidate, fit)
 
     def _stands_alone(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
         """Whether the keyframes alone make a pipe of it: no stub, both sides seen (a board or a step shows one)."""

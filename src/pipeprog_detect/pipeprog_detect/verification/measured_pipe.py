@@ -28,7 +28,7 @@ class MeasuredPipe:
     """A candidate after the keyframes: its cylinder and the standard deviation of its radius [m].
 
     `rims`: evidence for an end rim at its start and at its end (`pipe_ends.End.odds`). `ends`: its start and its end,
-    once all pipes are known.
+    once all pipes are known. `fit`: of its contour, where that has measured it.
     """
 
     candidate: Candidate
@@ -36,6 +36,12 @@ class MeasuredPipe:
     radius_sigma: float
     rims: tuple[float, float] = (0.0, 0.0)
     ends: tuple[PipeEnd, PipeEnd] = (PipeEnd(), PipeEnd())
+    fit: ContourFit | None = None
+
+    @classmethod
+    def of_contour(cls, candidate: Candidate, fit: ContourFit) -> MeasuredPipe:
+        """The cylinder that the contour says."""
+        return cls(candidate, fit.cylinder, fit.radius_sigma, fit.rims, fit=fit)
 
     @classmethod
     def of_cloud(cls, candidate: Candidate) -> MeasuredPipe:

@@ -78,6 +78,6 @@ def test_a_rod_of_another_size_is_no_thin_pipe(sigmas: float, stands: bool) -> N
     boq = BillOfQuantities((PipeClass("copper 17", planned, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     rod = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned + sigmas * sigma)
-    fit = ContourFit(rod, np.eye(5), sigma, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
+    fit = ContourFit(rod, np.eye(3)[1:], np.eye(5), sigma, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
     lines = _LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
     assert lines._accepts(fit, [], (0.6, 0.0)) is stands

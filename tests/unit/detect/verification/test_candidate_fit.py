@@ -31,7 +31,7 @@ def test_a_fit_keeps_to_the_planned_radius_that_it_was_sought_with(
     monkeypatch: pytest.MonkeyPatch, sigmas: float, stands: bool
 ) -> None:
     found = replace(PIPE, radius=PLANNED + sigmas * SIGMA)
-    fit = ContourFit(found, np.eye(5), SIGMA, 0.7, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
+    fit = ContourFit(found, np.eye(3)[1:], np.eye(5), SIGMA, 0.7, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
     monkeypatch.setattr(candidate_fit, "_at_radius", lambda *_: fit)
     boq = BillOfQuantities((PipeClass("copper 17", PLANNED, 10.0, (1.0, 0.0, 1.0), 1e-4),))
     assert BLURRED.blurred
@@ -67,7 +67,7 @@ def test_of_one_side_the_planned_radius_near_it_is_measured(
     evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
     rough = Candidate(replace(true, radius=true.radius + 0.006), 0.0015, 3000, evidence)
     wrong = replace(true, radius=true.radius + thicker)
-    fit = ContourFit(wrong, np.eye(5), sigma, 1.0, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
+    fit = ContourFit(wrong, np.eye(3)[1:], np.eye(5), sigma, 1.0, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
     fitter = CandidateFitter(_boq(true.radius), MeasurementCache())
     measured = fitter.near_planned(rough, fit, [BEFORE], pipe_views)
     assert measured is not None
@@ -79,7 +79,9 @@ def test_a_fit_out_of_the_candidates_reach_gives_way_to_a_planned_one(monkeypatc
     """Two pipes of a rack 8 cm apart: the outer edge of one and that of the other make a thick pipe."""
     rough = Candidate(replace(PIPE, radius=0.0436), 0.0023, 15000, CloudEvidence(2.6, 0.9, 0.0, 0.0032, 0.0, 3.0))
     both, own = (
-        ContourFit(replace(PIPE, radius=radius), np.eye(5), 2e-4, support, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
+        ContourFit(
+            replace(PIPE, radius=radius), np.eye(3)[1:], np.eye(5), 2e-4, support, 100.0, 20, (0.0, 0.0), 0.0, 0.5
+        )
         for radius, support in ((0.0559, 0.85), (0.0367, 1.0))
     )
     boq = _boq(0.0365, 0.0559)
