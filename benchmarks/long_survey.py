@@ -74,7 +74,7 @@ class Walker(Robot):
                 {
                     "minute": minute,
                     "images": self.sent,
-                    "keyframes": self._chosen,
+                    "keyframes chosen": self._chosen,
                     **{f"{name} [MB]": round(value) for name, value in memory.items()},
                     "all [MB]": round(sum(memory.values())),
                     **{f"slowest answer of {name} [s]": round(value, 2) for name, value in self.slowest.items()},
