@@ -70,11 +70,12 @@ class OverlapTracker:
 def place_overlap(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> float:
     """The share of what a view shows that each of SEEN_BEFORE views of earlier visits shows from the same side.
 
-    These are more than LOCAL_WINDOW views before it, and tied to it by points in common.
+    These are more than LOCAL_WINDOW views of each camera before it, and tied to it by points in common.
     keyframes: at least those of the model's views, by stamp.
     """
     rank = np.argsort(np.argsort(model.stamps))
-    earlier = np.flatnonzero(rank < rank[view] - LOCAL_WINDOW)
+    cameras = len({keyframes[stamp].frame for stamp in model.stamps})
+    earlier = np.flatnonzero(rank < rank[view] - LOCAL_WINDOW * cameras)
     earlier = earlier[model.covisible(view)[earlier] >= MIN_INLIERS]
     others = [(model.pose(other), keyframes[model.stamps[other]].camera) for other in earlier]
     if len(others) < SEEN_BEFORE:

@@ -108,3 +108,10 @@ def test_neighbours_in_time_and_views_that_nothing_ties_are_no_earlier_visit() -
     model.points = np.concatenate([model.points, model.points])  # the same points, not yet known to be the same
     model.point_of[last] += np.where(model.point_of[last] >= 0, 4000, 0)
     assert place_overlap(model, 19, keyframes) == 0.0
+
+
+def test_a_rig_has_as_many_more_neighbours_in_time_as_it_has_cameras() -> None:
+    model, keyframes = visits(*range(5), *range(14), 3.2)
+    sides = {stamp: replace(each, frame="left" if stamp // STEP % 2 else "right") for stamp, each in keyframes.items()}
+    assert place_overlap(model, 19, keyframes) > 0.9
+    assert place_overlap(model, 19, sides) == 0.0
