@@ -137,7 +137,7 @@ MUTANTS = {
         "detect/product/test_boq.py",
     ),
     "detector's node: no DELETEALL before the markers": Mutant(
-        "pipeprog_detect.pipe_output.PipeOutput.publish",
+        "pipeprog_detect.node.PipeOutput.publish",
         "[Marker(header=header, action=Marker.DELETEALL)]",
         "[]",
         "detect/test_node.py",

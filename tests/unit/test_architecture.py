@@ -44,7 +44,6 @@ GLUE = {
         "retirement_input",
         "worker",
     },
-    "pipeprog_detect": {"map_input", "pipe_output"},
     "pipeprog_bringup": {
         *{"replay", "session", "connections", "player", "listener", "survey_writer", "outline_marker"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},
@@ -157,7 +156,7 @@ def ids(path: Path) -> str:
 def knows_ros(path: Path) -> bool:
     """Whether a module may use ROS: the node of a core, and the glue."""
     package = owner(path)
-    return (package in CORES and path.stem == "node") or path.stem in GLUE.get(package, set())
+    return (package in CORES and path.stem == "node") or path.stem in GLUE.get(package, ())
 
 
 @pytest.mark.parametrize("path", MODULES, ids=ids)

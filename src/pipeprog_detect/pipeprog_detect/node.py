@@ -3,50 +3,191 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
+from nav_msgs.msg import Path
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, PointCloud2
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.limits import MAX_POSES
+from pipeprog_camera.limits import MAX_CLOUD_POINTS, MAX_POSES
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.map_input import POINTS, POSES, VELOCITIES, MapInput, map_command
-from pipeprog_detect.pipe_output import PipeOutput
-from pipeprog_detect.product.boq import load_boq
-from pipeprog_detect.types import Cylinder
+from pipeprog_detect.look.colour_view import BoardCircles
+from pipeprog_detect.product.boq import BillOfQuantities, load_boq
+from pipeprog_detect.product.classification import ClassProgress
+from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
+from pipeprog_detect.product.pipe_runs import PipeRun
+from pipeprog_detect.product.product import Product
+from pipeprog_detect.types import Cylinder, Pipe, RowVelocities
 from pipeprog_detect.worker import (
     Decoding,
     Event,
     Keyframe,
     KeyframeUnusable,
+    Map,
     NoPipes,
     PipesReady,
     Ready,
     Retire,
     serve,
 )
+from pipeprog_msgs import msg
+from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
 from pipeprog_node.journal import Journal, journal_of
-from pipeprog_node.keyframe_input import IMAGES, KeyframeInput
+from pipeprog_node.keyframe_input import IMAGES, REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
+from pipeprog_node.received import images as received_images
+from pipeprog_node.received import maps as received_maps
+from pipeprog_node.received.images import ReceivedCamera
 from pipeprog_node.received.keyframes import ReceivedRetirement
-from pipeprog_node.received.maps import ReceivedPoses, ReceivedStatus
+from pipeprog_node.received.maps import ReceivedCloud, ReceivedPoses, ReceivedStatus, ReceivedVelocities
 from pipeprog_node.retirement_input import RetirementInput
 from pipeprog_node.supervision import Supervision
 from pipeprog_node.worker import WorkerProcess
 
+POINTS, POSES, VELOCITIES = "map_points", "keyframe_poses", "keyframe_velocities"
+MAP_PARTS = (ReceivedStatus, ReceivedPoses, ReceivedCloud)
+MAX_PENDING = 16  # stamps of which some messages have arrived: poses come after each keyframe, maps rarely
 TICK = 1.0  # s
 # Ticks without a keyframe that a map contains, until the map does without. Both come from this machine or its network
 # within a second; ticks are counted, not seconds, so that a node that stood still first hears what waits for it.
 PATIENCE = 10
+
+
+class CompleteMap(NamedTuple):
+    """The parts of a map.
+
+    `camera` where the survey has refined the calibration, `velocities` where it was made with a rolling shutter.
+    """
+
+    status: ReceivedStatus
+    poses: ReceivedPoses
+    cloud: ReceivedCloud
+    camera: ReceivedCamera | None
+    velocities: ReceivedVelocities | None
+
+
+class MapInput:
+    """Subscribes to the parts of maps, which are one map when they have one stamp.
+
+    Attributes:
+        revision: the largest of the maps that are complete.
+    """
+
+    def __init__(self, intake: Intake, use: Callable[[], None]) -> None:
+        """`use` is called when a part has come."""
+        self._use = use
+        self._parts: OrderedDict[int, dict[type, Any]] = OrderedDict()  # by stamp
+        self.revision = 0
+        intake.subscribe(PointCloud2, POINTS, received_maps.map_points, self._keep, qos.latched())
+        intake.subscribe(Path, POSES, received_maps.keyframe_poses, self._keep, qos.latched())
+        intake.subscribe(CameraInfo, REFINED_CALIBRATION, received_images.camera_info, self._keep, qos.latched())
+        intake.subscribe(
+            msg.KeyframeVelocities, VELOCITIES, received_maps.keyframe_velocities, self._keep, qos.latched()
+        )
+        intake.subscribe(msg.SfmStatus, "sfm_status", received_maps.sfm_status, self._on_status, qos.latched())
+
+    @property
+    def newest(self) -> CompleteMap | None:
+        """The complete map whose first part came last."""
+        complete = (_complete(parts) for parts in reversed(self._parts.values()))
+        return next((parts for parts in complete if parts is not None), None)
+
+    def discard(self, taken: CompleteMap) -> None:
+        """Forgets a map and those before it."""
+        for stamp in [stamp for stamp in self._parts if stamp <= taken.status.stamp]:
+            del self._parts[stamp]
+
+    def _on_status(self, status: ReceivedStatus) -> None:
+        if status.revision:
+            self._keep(status)
+
+    def _keep(self, part: ReceivedCloud | ReceivedPoses | ReceivedStatus | ReceivedCamera | ReceivedVelocities) -> None:
+        parts = self._parts.setdefault(part.stamp, {})
+        parts[type(part)] = part
+        complete = _complete(parts)
+        if complete is not None:
+            self.revision = max(self.revision, complete.status.revision)
+        while len(self._parts) > MAX_PENDING or (len(self._parts) > 1 and self._points() > MAX_CLOUD_POINTS):
+            self._parts.popitem(last=False)
+        self._use()
+
+    def _points(self) -> int:
+        clouds = [parts[ReceivedCloud] for parts in self._parts.values() if ReceivedCloud in parts]
+        return sum(len(cloud.points) for cloud in clouds)
+
+
+def _complete(parts: Mapping[type, Any]) -> CompleteMap | None:
+    """The map of these parts, None while some of what belongs to it are missing."""
+    if not all(kind in parts for kind in MAP_PARTS):
+        return None
+    status, poses, cloud = (parts[kind] for kind in MAP_PARTS)
+    camera = parts.get(ReceivedCamera) if status.camera_refined else None
+    velocities = parts.get(ReceivedVelocities) if status.readout > 0.0 else None
+    if (status.camera_refined and camera is None) or (status.readout > 0.0 and velocities is None):
+        return None
+    return CompleteMap(status, poses, cloud, camera, velocities)
+
+
+def _map_command(whole: CompleteMap, final: bool) -> Map:
+    """The command to detect in a map."""
+    status, poses, cloud, camera, velocities = whole
+    return Map(
+        status.revision,
+        cloud.points,
+        cloud.normals,
+        poses.stamps,
+        poses.map_from_camera,
+        final,
+        None if camera is None else camera.camera,
+        None if velocities is None else RowVelocities(velocities.readout, velocities.linear, velocities.angular),
+        BoardCircles.of(status.circles),
+    )
+
+
+class PipeOutput:
+    """Publishes pipes and their markers."""
+
+    def __init__(self, node: Node, boq: BillOfQuantities) -> None:
+        self._boq = boq
+        self._array = node.create_publisher(msg.PipeArray, "pipes", qos.latched())
+        self._markers = node.create_publisher(MarkerArray, "pipe_markers", qos.latched())
+
+    def publish(self, product: Product, status: ReceivedStatus) -> None:
+        """The product of a map."""
+        header = messages.header(status.stamp, "map")
+        product = replace(product, scale_sigma=status.scale_sigma)
+        self._array.publish(
+            msg.PipeArray(
+                header=header,
+                map_revision=status.revision,
+                scale_source=status.scale_source,
+                scale_sigma=status.scale_sigma,
+                pipes=[_pipe_msg(pipe, product) for pipe in product.pipes],
+                classes=[_progress_msg(row, product, self._boq) for row in product.classes],
+                runs=[_run_msg(run) for run in product.runs],
+            )
+        )
+        markers = [Marker(header=header, action=Marker.DELETEALL)]
+        for number, marker in enumerate(pipe_markers(product.pipes, self._boq)):
+            markers += _marker_msgs(number, marker, header)
+        self._markers.publish(MarkerArray(markers=markers))
 
 
 class DetectNode(Node):
@@ -145,7 +286,7 @@ class DetectNode(Node):
             count = f"{len(velocities.linear)} velocities for {len(poses.stamps)} poses"
             self._refuse(status.revision, f"{VELOCITIES} has {count} of one map: each keyframe has one", VELOCITIES)
             return
-        command = map_command(newest, final)
+        command = _map_command(newest, final)
         if self._supervision.is_poison(command):
             self._refuse(status.revision, "detection processes died of this map before: it is not tried again")
             return
@@ -232,6 +373,87 @@ class DetectNode(Node):
         if self._left_out or self._intake.rejected:
             return DiagnosticStatus.WARN, "keyframes or messages are left out: the values say of which kind", values
         return DiagnosticStatus.OK, "detecting" if self._revision else "waiting for a map", values
+
+
+def _pipe_msg(pipe: Pipe, product: Product) -> msg.Pipe:
+    start, end = pipe.ends
+    return msg.Pipe(
+        id=pipe.id,
+        start=_point(pipe.cylinder.start),
+        end=_point(pipe.cylinder.end),
+        radius=pipe.cylinder.radius,
+        radius_sigma=pipe.radius_sigma,
+        class_name=pipe.class_name or "",
+        class_probability=pipe.class_probability,
+        class_kmeans=pipe.class_kmeans,
+        visible_arc=pipe.visible_arc,
+        rmse=pipe.rmse,
+        points=pipe.points,
+        length_sigma=product.length_sigma(pipe),
+        start_sigma=start.sigma,
+        end_sigma=end.sigma,
+        start_state=start.state,
+        end_state=end.state,
+        material=pipe.material,
+        material_probability=pipe.material_probability,
+    )
+
+
+def _run_msg(run: PipeRun) -> msg.PipeRun:
+    return msg.PipeRun(
+        id=run.id,
+        pipes=list(run.pipes),
+        barrel_length=run.barrel,
+        centre_line_length=run.centre_line,
+        joints=[
+            msg.PipeJoint(
+                kind=joint.kind, pipes=list(joint.pipes), angle=joint.angle, length=joint.length, miss=joint.miss
+            )
+            for joint in run.joints
+        ],
+    )
+
+
+def _marker_msgs(number: int, marker: PipeMarker, header: Header) -> list[Marker]:
+    x, y, z, w = marker.orientation.tolist()
+    red, green, blue = marker.color
+    cylinder = Marker(
+        header=header,
+        ns="pipes",
+        id=number,
+        type=Marker.CYLINDER,
+        pose=Pose(position=_point(marker.centre), orientation=Quaternion(x=x, y=y, z=z, w=w)),
+        scale=Vector3(x=2.0 * marker.radius, y=2.0 * marker.radius, z=marker.length),
+        color=ColorRGBA(r=red, g=green, b=blue, a=1.0),
+    )
+    label = Marker(
+        header=header,
+        ns="labels",
+        id=number,
+        type=Marker.TEXT_VIEW_FACING,
+        pose=Pose(position=_point(marker.text_position)),
+        scale=Vector3(z=LABEL_HEIGHT),
+        color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0),
+        text=marker.text,
+    )
+    return [cylinder, label]
+
+
+def _point(position: NDArray[np.float64]) -> Point:
+    x, y, z = position.tolist()
+    return Point(x=x, y=y, z=z)
+
+
+def _progress_msg(row: ClassProgress, product: Product, boq: BillOfQuantities) -> msg.ClassProgress:
+    color = next(planned.color for planned in boq.classes if planned.name == row.name)
+    return msg.ClassProgress(
+        class_name=row.name,
+        outer_radius=row.outer_radius,
+        planned_length=row.planned,
+        installed_length=row.installed,
+        installed_sigma=product.installed_sigma(row.name),
+        color=ColorRGBA(r=color[0], g=color[1], b=color[2], a=1.0),
+    )
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.keyframe_cache import Keyframes
-from pipeprog_detect.map_input import MapInput
+from pipeprog_detect.node import MapInput
 from pipeprog_node.received.images import ReceivedCamera
 from pipeprog_node.received.maps import ReceivedCloud, ReceivedPoses, ReceivedStatus
 

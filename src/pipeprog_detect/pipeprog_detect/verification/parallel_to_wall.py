@@ -29,7 +29,7 @@ def parallel_to_wall(measured: MeasuredPipe, around: SceneContext) -> MeasuredPi
 
     Cameras that pass along a thin pipe at one height see its contour exactly and its distance badly: its ends are
     centimetres off while its image fits. With the covariance of the contour the observation moves only what the contour
-    leaves open (update of a Kalman filter: P. S. Maybeck, Stochastic Models, Estimation and Control, 1979, eq. 5.37).
+    leaves open: the measurement update of a Kalman filter (R. E. Kalman, 1960).
     """
     fit = measured.fit
     if fit is None:
