@@ -121,7 +121,7 @@ def _annealed(
     half_width = float(np.median(samples.half_width))
     grid = qmc.Sobol(5, seed=random).random(FIRST_ROUND) * 2.0 - 1.0
     population = np.concatenate([np.zeros((1, 5)), seeds, grid * reach])
-    lines = np.stack([samples.jacobian[samples.side == side].mean(axis=0) for side in (0, 1)], axis=1)
+    lines = np.stack([samples.jacobian[samples.side == side].mean(axis=0) for side in np.unique(samples.side)], axis=1)
     width = max(FIRST_SMEAR * half_width, LEAST_SMEAR)
     spread = FIRST_SPREAD * reach
     first, step = float(offsets[0]), float(offsets[1] - offsets[0])
@@ -140,7 +140,7 @@ def _annealed(
 
 
 def _survivors(displacement: FloatArray) -> NDArray[np.int64]:
-    """Indices of the first `ELITES` of displacements (M, 2) [px] with no more than `CROWD` in one cell.
+    """Indices of the first `ELITES` of displacements (M, sides) [px] with no more than `CROWD` in one cell.
 
     Keeps rivals alive, such as a contour and a shadow's edge beside it, until sub-pixel edges decide.
     """

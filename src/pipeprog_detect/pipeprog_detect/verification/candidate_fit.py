@@ -13,7 +13,8 @@ from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.one_sided import SeenArc
+from pipeprog_detect.silhouette.one_sided import SeenArc, with_radius
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question
 
@@ -78,12 +79,19 @@ class CandidateFitter:
 
         A shadow along a pipe is taken for its contour where the cameras never rise or fall. Pipes of sizes that nobody
         planned are rarer than shadows, but where the planned size finds no contour of its own the fit stands. The one
-        side that is seen of a pipe does not tell its radius either.
+        side that is seen of a pipe does not tell its radius either. The radii are tried in the order in which the fit
+        and the cloud together allow them.
         """
         if fit is None or (self.is_planned(fit) and fit.radius_sigma < TOLD * fit.cylinder.radius):
             return fit
         radius = fit.cylinder.radius
-        for planned in sorted(self._radii(), key=lambda each: abs(each - radius)):
+        told = np.array([radius, candidate.cylinder.radius])
+        sigmas = np.array([fit.radius_sigma, _sigma(candidate)])
+
+        def misfit(planned: float) -> float:
+            return float((((told - planned) / np.hypot(sigmas, MANUFACTURE * planned)) ** 2).sum())
+
+        for planned in sorted(self._radii(), key=misfit):
             if abs(planned / radius - 1.0) < NEAR_PLANNED:
                 again = _at_radius(fit.cylinder, planned, abs(planned - radius), views, others)
                 again = again or _of_one_side(replace(candidate, cylinder=fit.cylinder), planned, views, others)
@@ -177,7 +185,7 @@ def _of_one_side(
     """The fit of a candidate of which one side is seen, with a radius that this side cannot tell; None without one."""
     sigma = _sigma(candidate)
     seen = SeenArc(candidate.evidence.arc, sigma)
-    known = replace(candidate.cylinder, radius=radius)
+    known = with_radius(Scene.of(candidate.cylinder, views, others), seen, radius)
     return refine(Start(known, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.one_sided import SeenArc, arc_precision, only_visible_side
+from pipeprog_detect.silhouette.one_sided import SeenArc, arc_precision, only_visible_side, with_radius
 from pipeprog_detect.silhouette.scene import Scene, frame, viewing_direction
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -61,3 +61,15 @@ def test_an_arc_leaves_the_radius_open_along_its_sagitta(limb: float) -> None:
     towards = np.concatenate([middle, middle, [0.0]])
     assert towards @ information @ towards == pytest.approx(2.0 / SEEN.sigma**2)
     assert np.linalg.eigvalsh(information).min() > 0.0
+
+
+def test_with_another_radius_the_surface_stays_where_it_was_seen(pipe_views: list[View]) -> None:
+    """The arc's middle is on both surfaces; without a neighbour both sides are seen, and the axis stays."""
+    scene = Scene.of(PIPE, pipe_views, [NEIGHBOUR])
+    thicker = with_radius(scene, SEEN, PIPE.radius + 0.015)
+    middle = SEEN.middle(-side_of_the_neighbour(pipe_views)) @ scene.basis
+    assert thicker.radius == pytest.approx(PIPE.radius + 0.015)
+    for one, other in ((PIPE.start, thicker.start), (PIPE.end, thicker.end)):
+        np.testing.assert_allclose(other + thicker.radius * middle, one + PIPE.radius * middle, atol=1e-12)
+    alone = with_radius(Scene.of(PIPE, pipe_views, []), SEEN, PIPE.radius + 0.015)
+    np.testing.assert_array_equal(alone.start, PIPE.start)

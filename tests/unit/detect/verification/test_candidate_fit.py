@@ -11,6 +11,8 @@ import pytest
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.silhouette.one_sided import SeenArc, with_radius
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification import candidate_fit
 from pipeprog_detect.verification.candidate_fit import CandidateFitter
@@ -72,6 +74,20 @@ def test_of_one_side_the_planned_radius_near_it_is_measured(
     measured = fitter.near_planned(rough, fit, [BEFORE], pipe_views)
     assert measured is not None
     assert measured is not fit
+    assert measured.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
+
+
+def test_the_radius_that_one_side_does_not_tell_is_the_one_that_the_cloud_allows(pipe_views: list[View]) -> None:
+    """The fit is 12 mm too thin at 1.2 sigma, with its visible surface in place, nearer a thinner size of the plan."""
+    true = pipe_and_wall.PIPE
+    evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
+    rough = Candidate(replace(true, radius=true.radius + 0.003), 0.0015, 3000, evidence)
+    scene, seen = Scene.of(true, pipe_views, [BEFORE]), SeenArc(evidence.arc, 0.0015)
+    thin = with_radius(scene, seen, 0.92 * true.radius)
+    fit = ContourFit(thin, np.eye(3)[1:], np.eye(5), 0.01, 1.0, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
+    boq = _boq(true.radius, 0.9 * true.radius)
+    measured = CandidateFitter(boq, MeasurementCache()).near_planned(rough, fit, [BEFORE], pipe_views)
+    assert measured is not None
     assert measured.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
 
 
