@@ -151,10 +151,10 @@ def detect_outside(
     # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
     criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
     measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
-    measured = _without_false_lines(_genuine(measured, around, judging), prepared.points, judging)
+    measured = _without_false_lines(_genuine(measured, around, judging), prepared, judging)
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
-    lost = find_thin_pipes(prepared.points, THICKEST_LINE, measured, judging, boq, edges)
+    lost = find_thin_pipes(prepared.points, around.planes, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
     measured = [parallel_to_wall(each, around) for each in measured]
     whole = with_open_ends(joined(measured, judging), around, judging)
@@ -203,16 +203,18 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
     return [each for each, is_own in zip(clear, own, strict=True) if is_own]
 
 
-def _without_false_lines(measured: list[MeasuredPipe], points: FloatArray, views: Sequence[View]) -> list[MeasuredPipe]:
-    """Those that are no false lines, as thin ones may be, whose section the points (N, 3) do not show."""
+def _without_false_lines(
+    measured: list[MeasuredPipe], prepared: PreparedCloud, views: Sequence[View]
+) -> list[MeasuredPipe]:
+    """Those that are no false lines, as thin ones may be, whose section the cloud does not show."""
     if not views:
         return measured
-    single = points.astype(np.float32)
+    points, walls = prepared.points.astype(np.float32), prepared.around.planes
     cylinders = [each.cylinder for each in measured]
 
     def is_genuine(number: int) -> bool:
         each, others = cylinders[number], cylinders[:number] + cylinders[number + 1 :]
-        return each.radius >= THICKEST_LINE or not is_false_line(each, single, views, others)
+        return each.radius >= THICKEST_LINE or not is_false_line(each, points, walls, views, others)
 
     return [each for number, each in enumerate(measured) if is_genuine(number)]
 

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.silhouette.apparent_contour import in_image
 from pipeprog_detect.types import Cylinder, View
 
@@ -71,7 +72,7 @@ def at_cloud_depth(
     """
     towards = _sight(cylinder, centre)[1]
     depth = float((cylinder.start - centre) @ towards)
-    bins, cell, aside, far = _beside(cylinder, points, centre)
+    bins, cell, aside, far, _ = _beside(cylinder, points, centre)
     inner = np.abs(aside) < 0.6 * cylinder.radius
     front = by_bin(cell[inner], far[inner], bins, FRONT)
     flanks = []
@@ -97,25 +98,31 @@ def at_cloud_depth(
     return Cylinder(ends[0], ends[1], cylinder.radius)
 
 
-def is_edge_of_face(cylinder: Cylinder, points: NDArray[np.float32], views: Sequence[View]) -> bool:
+def is_edge_of_face(
+    cylinder: Cylinder, points: NDArray[np.float32], views: Sequence[View], walls: Sequence[Plane]
+) -> bool:
     """Whether a face whose edge it is goes on beside it: a tray's, a duct's or a board's.
 
     Seen from the mean centre of the views, the cloud's points (N, 3) then lie as far away beside it, on one side, as
     where it is, and on the other side farther away by its diameter at least. What the cloud shows there may be nearer
-    than it, since lines tell the depth of an edge badly, but not behind it.
+    than it, since lines tell the depth of an edge badly, but not behind it. One of the `walls`, seen aslant, is farther
+    away on one side as well; it has no edge where it goes on.
     """
     centre = mean_centre(cylinder, views)
     if centre is None:
         return False
     depth, radius = float((cylinder.start - centre) @ _sight(cylinder, centre)[1]), cylinder.radius
-    bins, cell, aside, far = _beside(cylinder, points, centre)
+    bins, cell, aside, far, rows = _beside(cylinder, points, centre)
 
-    def level(least: float, most: float) -> FloatArray:
+    def level(least: float, most: float, values: NDArray[np.floating] = far) -> FloatArray:
         there = (aside > least * radius) & (aside < most * radius)
-        return by_bin(cell[there], far[there], bins, 50.0)
+        return by_bin(cell[there], values[there], bins, 50.0)
 
     on, beside = level(-0.6, 0.6), (level(-FACE[1], -FACE[0]), level(*FACE))
     shown = on - depth < 2.0 * radius
+    for wall in walls:
+        off = np.abs(points[rows] @ wall.normal.astype(np.float32) - np.float32(wall.offset))
+        shown &= ~((level(-FACE[1], -FACE[0], off) < radius) & (level(*FACE, off) < radius))
     flush, open_beside = (
         [np.abs(each - on) < 2.0 * radius for each in beside],
         [~(each - on < 2.0 * radius) for each in beside],
@@ -129,10 +136,11 @@ def is_edge_of_face(cylinder: Cylinder, points: NDArray[np.float32], views: Sequ
 
 def _beside(
     cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray
-) -> tuple[int, NDArray[np.int64], NDArray[np.floating], NDArray[np.floating]]:
+) -> tuple[int, NDArray[np.int64], NDArray[np.floating], NDArray[np.floating], NDArray[np.int64]]:
     """The cloud's points (N, 3) that `centre` sees along a cylinder, no farther from its depth than `DEPTH_REACH`.
 
-    Number of bins along it; bin (M,), distance from the axis in the image, at its depth (M,) [m], and depth (M,) [m].
+    Number of bins along it; bin (M,), distance from the axis in the image, at its depth (M,) [m], depth (M,) [m], and
+    row among the points (M,).
     """
     axis, towards, side = _sight(cylinder, centre)
     depth = float((cylinder.start - centre) @ towards)
@@ -145,7 +153,7 @@ def _beside(
     along = (place > 0) & (place < cylinder.length)
     bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
     cell = np.clip((place[along] / cylinder.length * bins).astype(np.int64), 0, bins - 1)
-    return bins, cell, aside[along], far[along]
+    return bins, cell, aside[along], far[along], np.flatnonzero(near)[along]
 
 
 @njit(cache=True, nogil=True)

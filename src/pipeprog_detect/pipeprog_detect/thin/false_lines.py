@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.silhouette.extension import STEP_AT
 from pipeprog_detect.silhouette.scene import SPACING, Scene
 from pipeprog_detect.thin.depth_from_cloud import is_edge_of_face
@@ -25,10 +26,17 @@ ONE_STAIR = 2.0 * ONE_STEP
 
 
 def is_false_line(
-    cylinder: Cylinder, points: NDArray[np.float32], views: Sequence[View], others: Sequence[Cylinder]
+    cylinder: Cylinder,
+    points: NDArray[np.float32],
+    walls: Sequence[Plane],
+    views: Sequence[View],
+    others: Sequence[Cylinder],
 ) -> bool:
-    """Whether a thin cylinder is the edge of a face in the cloud (N, 3), or one step of the light in the views."""
-    return is_edge_of_face(cylinder, points, views) or is_one_step(Scene.of(cylinder, views, others))
+    """Whether a thin cylinder is the edge of a face in the cloud (N, 3), or one step of the light in the views.
+
+    `walls`: planes of the cloud, whose faces have no edge where they go on.
+    """
+    return is_edge_of_face(cylinder, points, views, walls) or is_one_step(Scene.of(cylinder, views, others))
 
 
 def is_one_step(scene: Scene) -> bool:

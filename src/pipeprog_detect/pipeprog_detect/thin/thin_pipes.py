@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
+from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
@@ -38,10 +39,8 @@ MOST_PROPOSED, MOST_POINTS = 40, 600_000
 # Without support by the cloud, this support of the contour is required, and half of it on each side separately: the
 # edge of a duct, whose faces differ in brightness, is one side, with texture for the other.
 LINES_CONVINCING = (0.6, 0.3)
-# What runs parallel to known pipes has other evidence beside its contour, as a candidate of the cloud has. Where no fit
-# has half of it on each side, the segment pairs have still shown both sides in four views: then each must be seen
-# better than texture, whose support is 0.11 at the most (`edge_support`).
-PARALLEL_CONVINCING = ((CONVINCING, 0.5 * CONVINCING), (CONVINCING, 0.11))
+# What runs parallel to known pipes has other evidence beside its contour, as a candidate of the cloud has.
+PARALLEL_CONVINCING = (CONVINCING, 0.5 * CONVINCING)
 # Standard deviation of the distance of a pipe found by its lines [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
 # The axes of pipes side by side are at least two radii apart.
@@ -54,6 +53,7 @@ FLAT, SURELY = 0.5, 2.0
 
 def find_thin_pipes(
     points: NDArray[np.floating],
+    walls: Sequence[Plane],
     thickest: float,
     found: Sequence[MeasuredPipe],
     views: Sequence[View],
@@ -67,6 +67,7 @@ def find_thin_pipes(
 
     Args:
         points: of the cloud (N, 3).
+        walls: its planes.
         thickest: largest radius [m].
         found: the pipes of the cloud.
         views: the keyframes.
@@ -84,7 +85,7 @@ def find_thin_pipes(
     def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
             return
-        if is_false_line(fit.cylinder, some, views, known):
+        if is_false_line(fit.cylinder, some, walls, views, known):
             return
         thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
         known.append(fit.cylinder)
@@ -159,7 +160,7 @@ class _LineFitter:
         ]
         fits = [refine(each, self.views, known, self.radii) for each in starts]
         seen = [fit for fit in fits if fit is not None]
-        good = (fit for least in PARALLEL_CONVINCING for fit in seen if self._accepts(fit, known, least))
+        good = (fit for fit in seen if self._accepts(fit, known, PARALLEL_CONVINCING))
         return next(good, None)
 
     def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:

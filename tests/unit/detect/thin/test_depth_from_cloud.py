@@ -8,6 +8,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.thin.depth_from_cloud import at_cloud_depth, covers, is_edge_of_face, mean_centre
 from pipeprog_detect.thin.line_triangulation import SAME_LINE
 from pipeprog_detect.types import Cylinder, View
@@ -68,7 +70,26 @@ def test_a_line_with_a_face_on_one_side_is_that_faces_edge(
         [rng.uniform(-0.35, 0.35, len(height)), deeper + rng.normal(0.0, 2e-3, len(height)), height], axis=1
     )
     points = points[np.isfinite(points).all(axis=1)].astype(np.float32)
-    assert is_edge_of_face(line, points, pipe_views) == edge
+    assert is_edge_of_face(line, points, pipe_views, []) == edge
+
+
+def test_a_wall_that_is_seen_aslant_has_no_edge_behind_a_pipe(pipe_views: list[View]) -> None:
+    """15 degrees aslant it is 28 mm farther away from one strip beside the pipe to the other; stereo fills the pipe in.
+
+    A line along the edge of a board, 15 mm before the same wall, is that board's.
+    """
+    line = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    rng = np.random.default_rng(3)
+    slope, height = float(np.tan(np.radians(15.0))), rng.uniform(-0.07, 0.07, 18000)
+    along, noise = rng.uniform(-0.35, 0.35, len(height)), rng.normal(0.0, 2e-3, len(height))
+    wall = Plane(np.array([0.0, 1.0, -slope]) / np.hypot(1.0, slope), 0.022 / float(np.hypot(1.0, slope)), 4.0)
+
+    def edge(nearer: FloatArray) -> bool:
+        cloud = np.stack([along, 0.022 + slope * height - nearer + noise, height], axis=1).astype(np.float32)
+        return is_edge_of_face(line, cloud, pipe_views, [wall])
+
+    assert not edge(np.where(np.abs(height) < 0.009, 0.008, 0.0))
+    assert edge(np.where(height < 0.009, 0.015, 0.0))
 
 
 def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:

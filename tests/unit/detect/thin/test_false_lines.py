@@ -21,7 +21,7 @@ def test_the_edge_of_a_shadow_is_one_step(radius: float, side: float, empty_view
     half = np.array([0.0, 0.0, 0.2])
     line = Cylinder(place - half, place + half, radius)
     assert is_one_step(Scene.of(line, empty_views, []))
-    assert is_false_line(line, wall_points().astype(np.float32), empty_views, [])
+    assert is_false_line(line, wall_points().astype(np.float32), [], empty_views, [])
 
 
 @pytest.mark.parametrize(("beyond", "is_step"), [(-4.0, True), (-8.0, False), (4.0, False)])
@@ -39,7 +39,7 @@ def test_light_that_goes_on_beside_a_step_is_the_steps(
 
 def test_a_pipe_is_none(pipe_views: list[View]) -> None:
     assert not is_one_step(Scene.of(PIPE, pipe_views, []))
-    assert not is_false_line(PIPE, wall_points().astype(np.float32), pipe_views, [])
+    assert not is_false_line(PIPE, wall_points().astype(np.float32), [], pipe_views, [])
 
 
 def test_what_no_view_shows_is_no_step(pipe_views: list[View]) -> None:
