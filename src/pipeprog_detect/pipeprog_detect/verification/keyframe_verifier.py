@@ -47,7 +47,8 @@ class KeyframeVerifier:
         """Whether the keyframes make a pipe of a candidate that the cloud alone does not.
 
         They must support more than half of its contour, which must have a planned radius: shadows have contours, too.
-        Where the cloud resolves its section and has that radius as well, any support that makes a fit suffices.
+        Where the cloud resolves its section and has that radius as well, any support that makes a fit suffices. Where
+        it does not, a glossy pipe's highlight may be taken for its contour, unless the radius is held to a planned one.
         """
         cylinder = candidate.cylinder
         if any(_resembles(cylinder, refused) for refused in self._refused):
@@ -55,6 +56,8 @@ class KeyframeVerifier:
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
         fit = self._fitter.fit(candidate, [], views, follow=False)
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
+        if candidate.blurred and (fit is None or not self._fitter.is_planned(fit)):
+            fit = self._fitter.of_planned_radius(candidate, [], self._views)
         if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
             self._refused.append(cylinder)
             return False

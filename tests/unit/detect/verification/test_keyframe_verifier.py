@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import ContourConfig, DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
+from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, View
+from pipeprog_detect.verification.candidate_fit import CandidateFitter
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
 from tests.unit.detect.straight_ahead import looking_along_y
@@ -26,6 +31,23 @@ def test_a_pipe_that_few_keyframes_of_many_show_is_verified(pipe_views: list[Vie
     candidate = Candidate(rough, 0.002, 900, evidence)
     assert KeyframeVerifier(views, BOQ).verify(candidate)
     assert not KeyframeVerifier(elsewhere, BOQ).verify(candidate)
+
+
+def test_a_blurred_candidate_whose_highlight_makes_a_contour_is_verified_at_a_planned_radius(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its fit has two thirds of the planned radius; what the cloud resolves gets no second answer."""
+    highlight = ContourFit(
+        replace(PIPE, radius=0.65 * PIPE.radius), np.eye(3)[1:], np.eye(5), 2e-4, 0.6, 75.0, 20, (0.0, 0.0), 0.0, 0.5
+    )
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: highlight)
+    blurred, resolved = (
+        Candidate(replace(PIPE, radius=0.04), 0.002, 900, CloudEvidence(np.pi, 0.9, 0.0, noise, 0.0, 3.0))
+        for noise in (0.01, 0.001)
+    )
+    assert blurred.blurred
+    assert KeyframeVerifier(pipe_views, BOQ).verify(blurred)
+    assert not KeyframeVerifier(pipe_views, BOQ).verify(resolved)
 
 
 def test_the_keyframes_measure_a_pipe_unless_contours_are_disabled(pipe_views: list[View]) -> None:
