@@ -144,14 +144,13 @@ class MetricTracker:
 
     def _unrolled(self, posed: PosedEvidence, rolling: RollingViews) -> PosedEvidence:
         """The same by ellipses as the middle row's camera has them."""
+        detected: dict[int, tuple[ImageEllipses, list[BoardObservation]]] = {}
 
         def evidence(ellipses: Mapping[int, ImageEllipses]) -> PosedEvidence:
-            boards = self._board_file.boards
-            observations = self._observations | {
-                stamp: detect_boards(ellipses[stamp], boards, self._cameras[stamp])
-                for stamp in ellipses
-                if stamp in rolling.motions
-            }
+            for stamp, own in ellipses.items():
+                if stamp in rolling.motions and (stamp not in detected or detected[stamp][0] is not own):
+                    detected[stamp] = own, detect_boards(own, self._board_file.boards, self._cameras[stamp])
+            observations = self._observations | {stamp: found for stamp, (_, found) in detected.items()}
             return replace(posed, seen=self._evidence(posed.camera, posed.poses, ellipses, observations))
 
         def place(ellipses: Mapping[int, ImageEllipses]) -> tuple[Mapping[int, ImageEllipses], list[PlacedBoard]]:

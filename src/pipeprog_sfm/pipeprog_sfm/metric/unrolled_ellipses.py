@@ -7,7 +7,7 @@ their planes then give the depth of each edge point.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +46,8 @@ def unrolled_ellipses(
 ) -> dict[int, ImageEllipses]:
     """All ellipses, those of views of known motion as the middle row's camera has them.
 
+    Those that do not change once the boards are placed are returned as the same objects.
+
     Args:
         ellipses: measured, by stamp [ns].
         cameras: of the images, by stamp.
@@ -60,20 +62,22 @@ def unrolled_ellipses(
             if len(inside):
                 planes[stamp] = _facing_planes(found, inside, cameras[stamp])
 
-    def shifted() -> dict[int, ImageEllipses]:
-        return dict(ellipses) | {
-            stamp: _unrolled(ellipses[stamp], own, rolling.motions[stamp], cameras[stamp])
-            for stamp, own in planes.items()
+    def shifted(stamps: Iterable[int]) -> dict[int, ImageEllipses]:
+        return {
+            stamp: _unrolled(ellipses[stamp], planes[stamp], rolling.motions[stamp], cameras[stamp]) for stamp in stamps
         }
 
-    named, boards = place(shifted())
+    first = dict(ellipses) | shifted(planes)
+    named, boards = place(first)
+    changed = set()
     for board in boards:
         for view in board.views:
             if view.stamp not in planes:
                 continue
             members = (named[view.stamp].centres[:, None] == view.seen.ellipse_centres[None]).all(-1).any(1)
             planes[view.stamp][members] = _plane(board, poses[view.stamp])
-    return shifted()
+            changed.add(view.stamp)
+    return first | shifted(changed)
 
 
 def _facing_planes(ellipses: ImageEllipses, points: FloatArray, camera: Camera) -> FloatArray:

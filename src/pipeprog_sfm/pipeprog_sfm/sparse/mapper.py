@@ -22,7 +22,7 @@ from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, rejection_reason
 from pipeprog_sfm.sparse.row_motion import predicted, row_motions
 from pipeprog_sfm.sparse.self_calibration import Priors, Refinement, refine
-from pipeprog_sfm.sparse.sparse_map import SparseMap
+from pipeprog_sfm.sparse.sparse_map import MAX_TURNS, SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.sparse.two_view import model_from_pair
 
@@ -148,7 +148,7 @@ class Mapper:
     def finish(self) -> None:
         """Tries the waiting keyframes once more and adjusts everything."""
         for model in self.map.models:
-            self.map.adjust_globally(model)
+            self.map.adjust_globally(model, MAX_TURNS)
         while self.map.waiting:
             before = len(self.map.waiting)
             self._retry(list(self.map.waiting))
@@ -221,7 +221,7 @@ class Mapper:
         self.map.models.append(best)
         self.map.revision += 1
         if self.map.readout:
-            self.map.adjust_globally(best)
+            self.map.adjust_globally(best, MAX_TURNS)
         self.map.waiting = [stamp for stamp in self.map.waiting if stamp not in best.stamps]
         return True
 

@@ -48,8 +48,8 @@ class OverlapTracker:
         """Forgets a keyframe: if it is added again, its overlap is reported again."""
         self._reported.pop(stamp, None)
 
-    def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel) -> list[OverlapReport]:
-        """Overlap of the keyframes, by stamp, for which it changed since the last call."""
+    def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel, places: bool) -> list[OverlapReport]:
+        """Overlap of the keyframes, by stamp, for which it changed since the last call; `places`: that with places."""
         view_of = {stamp: view for view, stamp in enumerate(model.stamps)}
         tied = {stamp: model.features(view) for stamp, view in view_of.items()}
         digests = model.digests().tolist()
@@ -61,7 +61,7 @@ class OverlapTracker:
                 self._reported[stamp] = mark
                 near = (model.point_of[tied[one]] if one in tied else None for one in (before, stamp, after))
                 report = _report(keyframes[stamp], *near)
-                if stamp in view_of:
+                if places and stamp in view_of:
                     report = replace(report, place_overlap=place_overlap(model, view_of[stamp], keyframes))
                 changed.append(report)
         return changed

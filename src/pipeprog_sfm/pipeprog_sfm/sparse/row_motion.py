@@ -194,17 +194,18 @@ def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion
         by_point[:, 0, 0], by_point[:, 1, 1] = camera.fx / z, camera.fy / z
         by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
         by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
-        rows = np.concatenate([by_pose, times * by_pose], axis=2)
+        rows = np.concatenate([by_pose, times * by_pose], axis=2).reshape(-1, 12)
         weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * model.noise) ** 2) / model.noise**2
-        normal = np.einsum("n,nij,nik->jk", weights, rows, rows)
+        weighted = (np.repeat(weights, 2)[:, None] * rows).T
+        normal = weighted @ rows
         normal[np.arange(6, 12), np.arange(6, 12)] += precision
-        pull = np.einsum("n,nij,ni->j", weights, rows, error)
+        pull = weighted @ error.ravel()
         pull[6:] -= precision * moved
         change = np.linalg.solve(normal, pull)
         inside = inside @ rotation_from_vector(change[None, :3])[0].T + change[3:6]
         moved += change[6:]
         fitted = replace(motion, angular=motion.angular + moved[:3], linear=motion.linear + moved[3:])
-        if np.sqrt(((rows @ change) ** 2).sum(axis=1).mean()) < CONVERGED:
+        if np.sqrt(2.0 * ((rows @ change) ** 2).mean()) < CONVERGED:
             break
     return fitted
 

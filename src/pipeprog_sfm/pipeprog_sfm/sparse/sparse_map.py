@@ -21,7 +21,7 @@ from pipeprog_sfm.sparse.self_calibration import RADII, radial_residuals
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 ERROR_SAMPLE = 20_000  # observations that give the mean error: with a spread of 1 px, to 1 / sqrt(20 000) = 0.007 px
-MAX_TURNS = 3  # of shifts and poses after a global adjustment; a map that grows goes on at the next one
+MAX_TURNS = 3  # of shifts and poses where they are to settle: see `row_motion`
 SETTLED = 0.02  # px; a change of all features of a view by less moves its pose by less than their noise (0.3 px / 20)
 
 
@@ -95,11 +95,15 @@ class SparseMap:
                 model.filter(*model.observations(np.ones(len(model.points), bool)))
         return retired
 
-    def adjust_globally(self, model: SparseModel) -> None:
-        """Adjusts all views of a model; views whose poses are rejected afterwards wait again."""
-        adjust_model(model)
+    def adjust_globally(self, model: SparseModel, turns: int = 1) -> None:
+        """Adjusts all views of a model; views whose poses are rejected afterwards wait again.
+
+        turns: with a rolling shutter, of the shifts of features and the poses; a map that grows goes on at the next.
+        """
         if self.readout:
-            self._adjust_rolling(model)
+            self._adjust_rolling(model, turns)
+        else:
+            adjust_model(model)
         for view in reversed(range(len(model))):
             if len(model) > 2 and rejection_reason(model, view, self.matches.get(model.stamps[view], {})):
                 self.waiting.append(model.stamps[view])
@@ -117,11 +121,11 @@ class SparseMap:
                 model.replace_camera(view, self.keyframes[stamp].rays, self.keyframes[stamp].focal)
             unroll(model, self.keyframes, self.motions(model))
             adjust_points(model)
-            self.adjust_globally(model)
+            self.adjust_globally(model, MAX_TURNS)
             # Tracks that the wrong camera had cut or kept apart.
             for view in range(len(model)):
                 link(model, view, self.keyframes)
-            self.adjust_globally(model)
+            self.adjust_globally(model, MAX_TURNS)
 
     def motions(self, model: SparseModel, readout: float | None = None) -> dict[int, RowMotion]:
         """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout.
@@ -131,12 +135,13 @@ class SparseMap:
         readout = self.readout if readout is None else readout
         return row_motions(model, self.keyframes, readout) if readout else {}
 
-    def _adjust_rolling(self, model: SparseModel) -> None:
+    def _adjust_rolling(self, model: SparseModel, turns: int) -> None:
         """Finds the shifts of features and the poses in turns, until the shifts stay."""
-        for _ in range(MAX_TURNS):
-            if unroll(model, self.keyframes, self.motions(model)) < SETTLED:
-                return
+        for _ in range(turns):
+            change = unroll(model, self.keyframes, self.motions(model))
             adjust_model(model)
+            if change < SETTLED:
+                return
 
     def camera_from_model(self) -> dict[int, FloatArray]:
         """Poses (4, 4) of the published model's keyframes, in order of time."""
@@ -193,4 +198,4 @@ class SparseMap:
 
     def overlap_reports(self) -> list[OverlapReport]:
         """Overlap of the keyframes for which it changed since the last call."""
-        return self._overlaps.changed(self.keyframes, self.published)
+        return self._overlaps.changed(self.keyframes, self.published, places=not self.readout)

@@ -31,7 +31,7 @@ def test_overlap_is_the_share_of_the_hull_and_of_the_cells_that_tie_points_span(
     model.points = np.zeros((4, 3))
     model.point_of[:] = [0, 1, 2, 3, 0, 1, 2, -1]
     keyframes = {0: first, STEP: second, 2 * STEP: keyframe(2 * STEP, SQUARE)}
-    told = {tie.stamp: tie for tie in OverlapTracker().changed(keyframes, model)}
+    told = {tie.stamp: tie for tie in OverlapTracker().changed(keyframes, model, places=True)}
     assert (told[0].overlap, told[0].cell_overlap, told[0].tie_points) == (1.0, 1.0, 4)
     # Three corners span half of the square, in three of four cells.
     assert (told[STEP].overlap, told[STEP].cell_overlap) == (pytest.approx(0.5), 0.75)
@@ -49,7 +49,7 @@ def test_the_keyframes_before_and_after_are_those_of_the_same_camera() -> None:
         model.add_view(one.stamp, one.rays, one.focal, np.eye(4))
     model.points = np.zeros((8, 3))
     model.point_of[:] = [0, 1, 2, 3, 0, 1, 2, -1, 4, 5, 6, 7, 4, 5, -1, -1]
-    told = OverlapTracker().changed({one.stamp: one for one in (*left, *right)}, model)
+    told = OverlapTracker().changed({one.stamp: one for one in (*left, *right)}, model, places=True)
     assert [tie.stamp for tie in told] == [0, 1, STEP, STEP + 1]
     assert [tie.matches_next for tie in told] == [3, 2, 0, 0]
     assert [tie.matches_previous for tie in told] == [0, 0, 3, 2]
@@ -63,17 +63,17 @@ def test_features_shifted_to_the_middle_row_span_no_more_than_the_image_as_it_is
     model.add_view(0, wider.rays, wider.focal, np.eye(4))
     model.points = np.zeros((4, 3))
     model.point_of[:] = [0, 1, 2, 3]
-    assert [tie.overlap for tie in OverlapTracker().changed({0: wider}, model)] == [1.0]
+    assert [tie.overlap for tie in OverlapTracker().changed({0: wider}, model, places=True)] == [1.0]
 
 
 def test_it_is_told_again_when_it_changes_and_when_it_was_forgotten() -> None:
     one, overlaps, model = keyframe(0, SQUARE), OverlapTracker(), SparseModel()
-    assert len(overlaps.changed({0: one}, model)) == 1
-    assert overlaps.changed({0: one}, model) == []
+    assert len(overlaps.changed({0: one}, model, places=True)) == 1
+    assert overlaps.changed({0: one}, model, places=True) == []
     overlaps.forget(0)
-    assert len(overlaps.changed({0: one}, model)) == 1
+    assert len(overlaps.changed({0: one}, model, places=True)) == 1
     model.add_view(0, one.rays, one.focal, np.eye(4))
-    assert [tie.registered for tie in overlaps.changed({0: one}, model)] == [True]
+    assert [tie.registered for tie in overlaps.changed({0: one}, model, places=True)] == [True]
 
 
 def visits(*places: float) -> tuple[SparseModel, dict[int, Keyframe]]:
