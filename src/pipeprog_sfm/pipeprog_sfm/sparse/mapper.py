@@ -19,7 +19,7 @@ from pipeprog_sfm.features.sift import Features, extract
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
-from pipeprog_sfm.sparse.registration import add_view, rejection_reason
+from pipeprog_sfm.sparse.registration import add_view, doubtful_views, rejection_reason
 from pipeprog_sfm.sparse.row_motion import predicted, row_motions
 from pipeprog_sfm.sparse.self_calibration import Priors, Refinement, refine
 from pipeprog_sfm.sparse.sparse_map import MAX_TURNS, SparseMap
@@ -149,6 +149,9 @@ class Mapper:
         """Tries the waiting keyframes once more and adjusts everything."""
         for model in self.map.models:
             self.map.adjust_globally(model, MAX_TURNS)
+            for view in reversed(doubtful_views(model, self.map.keyframes) if self.map.readout else []):
+                if len(model) > 2:
+                    self.map.put_back(model, view)
         while self.map.waiting:
             before = len(self.map.waiting)
             self._retry(list(self.map.waiting))

@@ -22,6 +22,9 @@ MIN_INLIERS = 20  # of a pose: by chance one match in 18 000 lies within 4 px (o
 RIVAL = 0.5  # of a pose's inliers: if this share agrees on another pose, repeated texture makes the pose ambiguous
 MIN_SHARE = 0.25  # of the matches with the neighbours that must agree with a pose: a wrong pose has few per cent
 LOCAL_WINDOW = 8  # views that local bundle adjustment moves: those that see a point at 80 % overlap, and some more
+# Of the points that the views around it in time hold, a share from which on a view's velocity, and so its pose, may be
+# wrong: with the velocity off by 0.7 m/s (read-out 30 ms, a path that turned) a view held 0.4 of them.
+DOUBTFUL, AROUND = 0.6, 4
 MOVED = 3  # views, with the new one, whose velocities a new view changes by more than a quarter of its own change
 
 
@@ -95,6 +98,25 @@ def rejection_reason(model: SparseModel, view: int, matches: Mapping[int, MatchA
     if share < MIN_SHARE:
         return f"only {share:.0%} of the matches with its neighbours agree with its pose"
     return ""
+
+
+def doubtful_views(model: SparseModel, keyframes: Mapping[int, Keyframe]) -> list[int]:
+    """Views that hold far fewer points than the `AROUND` views of their camera nearest in time.
+
+    With a rolling shutter a view that is registered before what follows it may take a wrong velocity where the camera
+    turns; features that are unrolled by it agree with a wrong pose, which confirms the velocity.
+    keyframes: at least those of the model's views, by stamp.
+    """
+    held = np.array([len(model.seen(view)) for view in range(len(model))])
+    frames = np.array([keyframes[stamp].frame for stamp in model.stamps])
+    stamps = np.array(model.stamps)
+    doubtful = []
+    for view, stamp in enumerate(model.stamps):
+        others = np.flatnonzero((frames == frames[view]) & (stamps != stamp))
+        near = others[np.argsort(np.abs(stamps[others] - stamp), kind="stable")[:AROUND]]
+        if len(near) and held[view] < DOUBTFUL * np.median(held[near]):
+            doubtful.append(view)
+    return doubtful
 
 
 def epipolar_errors(model: SparseModel, view: int, other: int, matches: MatchArray) -> FloatArray:

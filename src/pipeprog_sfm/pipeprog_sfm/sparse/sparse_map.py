@@ -106,10 +106,14 @@ class SparseMap:
             adjust_model(model)
         for view in reversed(range(len(model))):
             if len(model) > 2 and rejection_reason(model, view, self.matches.get(model.stamps[view], {})):
-                self.waiting.append(model.stamps[view])
-                self.remove_view(model, view)
+                self.put_back(model, view)
         model.adjusted_at = len(model)
         self.revision += 1
+
+    def put_back(self, model: SparseModel, view: int) -> None:
+        """Takes a view out of its model, to wait again."""
+        self.waiting.append(model.stamps[view])
+        self.remove_view(model, view)
 
     def replace_camera(self, told: Camera, camera: Camera) -> None:
         """Gives all keyframes of one calibration another one, or the same; points and poses are adjusted."""

@@ -15,6 +15,7 @@ from scenes import CAMERA, STEP, pose, position_errors, view
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.sparse.mapper import Mapper
+from pipeprog_sfm.sparse.registration import doubtful_views
 from pipeprog_sfm.sparse.self_calibration import Priors
 
 READOUT = 0.03  # s
@@ -73,6 +74,22 @@ def test_a_fast_start_leaves_no_error() -> None:
     """The spline is off by 0.5 m/s there: what its own rows tell was too little while points followed its error."""
     mapper, truth = walk(READOUT, started_fast)
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 1e-3
+
+
+def test_a_view_that_holds_far_fewer_points_than_those_around_it_is_registered_anew() -> None:
+    """As one with a wrong velocity does: its features agree with a wrong pose alone."""
+    mapper, truth = walk(READOUT)
+    model = mapper.map.published
+    assert doubtful_views(model, mapper.map.keyframes) == []
+    view, stamp = 5, model.stamps[5]
+    held = len(model.seen(view))
+    first = model.offsets[view]
+    tied = np.flatnonzero(model.point_of[model.features(view)] >= 0)
+    model.point_of[first + tied[::2]] = -1
+    assert doubtful_views(model, mapper.map.keyframes) == [view]
+    mapper.finish()
+    assert len(model.seen(model.stamps.index(stamp))) > 0.9 * held
+    assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
 
 
 @pytest.fixture(scope="module")
