@@ -213,8 +213,10 @@ def _without_false_lines(
     cylinders = [each.cylinder for each in measured]
 
     def is_genuine(number: int) -> bool:
-        each, others = cylinders[number], cylinders[:number] + cylinders[number + 1 :]
-        return each.radius >= THICKEST_LINE or not is_false_line(each, points, walls, views, others)
+        each, others, fit = cylinders[number], cylinders[:number] + cylinders[number + 1 :], measured[number].fit
+        if each.radius >= THICKEST_LINE or (fit is not None and fit.is_round):
+            return True
+        return not is_false_line(each, points, walls, views, others)
 
     return [each for number, each in enumerate(measured) if is_genuine(number)]
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,10 +11,15 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
+from pipeprog_detect import detector
+from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.types import Cloud, Cylinder, Pipe
+from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+from tests.unit.detect.pipe_and_wall import PIPE, wall_points
 
 CONFIG = DetectConfig()
 NOISE = 2e-3
@@ -164,3 +170,16 @@ def test_a_cloud_too_thin_to_tell_its_noise_holds_no_pipes(front_end: str) -> No
     rng = np.random.default_rng(3)
     clumps = rng.uniform(0, 10, (40, 1, 3)) + rng.uniform(-0.03, 0.03, (40, 12, 3))
     assert detect(Cloud(clumps.reshape(-1, 3)), BOQ, DetectConfig(front_end=front_end)) == []
+
+
+@pytest.mark.parametrize(("flatness_sigma", "kept"), [(0.03, 1), (0.5, 0)])
+def test_what_the_views_show_to_be_round_is_no_edge(
+    flatness_sigma: float, kept: int, pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The cloud takes a thin pipe before a face for the edge of that face."""
+    monkeypatch.setattr(detector, "is_false_line", lambda *_: True)
+    thin = replace(PIPE, radius=0.0086)
+    fit = ContourFit(thin, np.eye(3)[1:], np.eye(5), 1e-4, 1.0, 100.0, 20, (0.0, 0.0), 0.0, flatness_sigma)
+    candidate = Candidate(thin, 1e-3, 100, CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0))
+    prepared = detector._prepare(Cloud(wall_points()), 0.1, lambda *_: None)
+    assert len(detector._without_false_lines([MeasuredPipe.of_contour(candidate, fit)], prepared, pipe_views)) == kept

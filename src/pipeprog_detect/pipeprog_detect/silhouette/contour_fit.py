@@ -14,6 +14,8 @@ from pipeprog_detect.types import Cylinder
 
 # Where the contour is not seen, edges of texture take its place, spread evenly within the robust loss [px].
 CLUTTER_ERROR = ROBUST / np.sqrt(3.0)
+# Flatness is 0 for a cylinder and 1 for a strip: one that is beyond the middle by two standard deviations is surely so.
+FLAT, SURELY = 0.5, 2.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,16 @@ class ContourFit:
     rims: tuple[float, float]
     flatness: float
     flatness_sigma: float
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the views surely show a flat strip."""
+        return self.flatness - FLAT > SURELY * self.flatness_sigma
+
+    @property
+    def is_round(self) -> bool:
+        """Whether the views surely show no flat strip: they see it from sides that differ enough."""
+        return FLAT - self.flatness > SURELY * self.flatness_sigma
 
 
 def contour_fit(found: AdjustedCylinder, ends: tuple[End | None, End | None]) -> ContourFit:

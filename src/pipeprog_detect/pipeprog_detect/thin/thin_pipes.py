@@ -47,8 +47,6 @@ LINE_DEPTH_SIGMA = 0.03
 TOUCHING = 2.0
 # Their axes are known to this [m].
 AXIS_SIGMA = 1e-3
-# Flatness is 0 for a cylinder and 1 for a strip: one that exceeds the middle by two standard deviations is a strip.
-FLAT, SURELY = 0.5, 2.0
 
 
 def find_thin_pipes(
@@ -85,7 +83,7 @@ def find_thin_pipes(
     def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
             return
-        if is_false_line(fit.cylinder, some, walls, views, known):
+        if not fit.is_round and is_false_line(fit.cylinder, some, walls, views, known):
             return
         thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
         known.append(fit.cylinder)
@@ -203,7 +201,7 @@ class _LineFitter:
                 for planned in self.radii
             )
             and Scene.of(fit.cylinder, self.views, known).support().weaker_share >= least[1]
-            and fit.flatness - FLAT <= SURELY * fit.flatness_sigma
+            and not fit.is_flat
         )
 
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_detect.silhouette.contour_fit import FLAT, SURELY
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.thin.line_segments import segment_pairs, straight_edges
 from pipeprog_detect.thin.line_triangulation import propose
 from pipeprog_detect.thin.pair_views import pair_views
-from pipeprog_detect.thin.thin_pipes import FLAT, SURELY
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, WALL, front_points, wall_points
 
