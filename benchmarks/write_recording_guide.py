@@ -86,7 +86,11 @@ ADVICE = {
         "Seed 41, 15 ms: not told 6 of 6 with 0.093 mm, a scale 0.074 % off and a read-out of 15.4 ms; told 6 of 6 "
         "with 0.093 mm and a scale 0.003 % off.\n"
         "Seed 61 (480p, 5 Hz), 15 ms: not told 6 of 6 with 0.204 mm, a scale 0.005 % and a camera path 0.6 mm off, "
-        "and a read-out of 15.5 ms; told 6 of 6 with 0.214 mm, scale and path as well.",
+        "and a read-out of 15.5 ms; told 6 of 6 with 0.214 mm, scale and path as well.\n"
+        "Seed 91 (720p, 5 Hz), 30 ms: not told 6 of 6 with 0.192 mm, a scale 0.013 % and a camera path 1.0 mm off, and "
+        "a read-out of 30.3 ms; told 6 of 6 with 0.187 mm, 0.010 % and 1.2 mm.\n"
+        "Seed 92 (720p, 10 Hz), 20 ms at 1.4 m/s: not told 6 of 6 with 0.086 mm, a scale 0.013 % and a camera path "
+        "1.3 mm off, and a read-out of 20.0 ms; told 6 of 6 with 0.090 mm, 0.009 % and 0.8 mm.",
     ),
 }
 COLUMNS = ("right class", "false", "F", "radius RMSE [mm]", "length error [%]", "scale error [%]")
