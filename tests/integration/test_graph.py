@@ -133,7 +133,8 @@ def test_a_replay_measures_planned_pipes_and_repeats_itself(tmp_path: Path) -> N
         for replay in (alone, disturbed):
             _, errors = replay.communicate(timeout=TIMEOUT)
             assert replay.returncode == 0, errors
-    assert len([pid for pid, addresses in sockets.items() if addresses]) == 1 + len(MODULES)
+    # At least: a worker that was just forked has its parent's sockets until it runs its own program.
+    assert len([pid for pid, addresses in sockets.items() if addresses]) >= 1 + len(MODULES)
     assert set().union(*sockets.values()) == {LOOPBACK}
     assert set((tmp_path / "found").read_text().split()) == set()
     for name in ("pipes.json", "cloud.ply", "frames.csv"):
