@@ -28,7 +28,7 @@ from pipeprog_detect.types import Cloud, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.grown_ends import with_grown_ends
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined, own_contours
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, joined, own_contours
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.open_ends import with_open_ends
 from pipeprog_detect.verification.parallel_to_wall import parallel_to_wall
@@ -156,7 +156,7 @@ def detect_outside(
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(prepared.points, around.planes, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
-    measured = [parallel_to_wall(each, around) for each in measured]
+    measured = _probable([parallel_to_wall(each, around) for each in measured], judging)
     whole = with_open_ends(joined(measured, judging), around, judging)
     return _abutted(with_grown_ends(whole, judging), around, judging)
 
@@ -201,6 +201,19 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
     ]
     own = own_contours([each.cylinder for each in clear], views)
     return [each for each, is_own in zip(clear, own, strict=True) if is_own]
+
+
+def _probable(measured: list[MeasuredPipe], views: Sequence[View]) -> list[MeasuredPipe]:
+    """Those that are probable now that all are known, as thin ones, along which few edges lie, may not be."""
+    if not views:
+        return measured
+    cylinders = [each.cylinder for each in measured]
+
+    def stands(number: int) -> bool:
+        each, others = cylinders[number], cylinders[:number] + cylinders[number + 1 :]
+        return each.radius >= THICKEST_LINE or is_probable(each, views, others)
+
+    return [each for number, each in enumerate(measured) if stands(number)]
 
 
 def _without_false_lines(

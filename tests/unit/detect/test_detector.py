@@ -183,3 +183,15 @@ def test_what_the_views_show_to_be_round_is_no_edge(
     candidate = Candidate(thin, 1e-3, 100, CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0))
     prepared = detector._prepare(Cloud(wall_points()), 0.1, lambda *_: None)
     assert len(detector._without_false_lines([MeasuredPipe.of_contour(candidate, fit)], prepared, pipe_views)) == kept
+
+
+def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View], empty_views: list[View]) -> None:
+    thin = PIPE.shifted(np.array([0.12, 0.0, 0.0]))
+    candidates = [
+        Candidate(each, 1e-3, 100, CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0))
+        for each in (PIPE, replace(thin, radius=0.0086))
+    ]
+    measured = [MeasuredPipe.of_cloud(each) for each in candidates]
+    assert detector._probable(measured, pipe_views) == measured[:1]
+    assert detector._probable(measured[:1], empty_views) == measured[:1]  # thick: the cloud shows it
+    assert detector._probable(measured, []) == measured

@@ -17,6 +17,9 @@ _HALF_SECTOR = 2.5
 # Half a step between two standard sizes, in r: from DN 15 to DN 200 the diameters of EN 10220 series 1 (21.3 to
 # 219.1 mm) rise in 11 steps, of 24 % in the geometric mean; half of ln 1.24.
 _HALF_STEP = 0.1076
+# With a greater standard deviation of the radius, in r, it lies by more than half a step from the true one for half of
+# the pipes, and the nearest standard size is most often a wrong one (0.75 quantile of the normal distribution: 0.674).
+VAGUEST = _HALF_STEP / 0.674
 
 
 @dataclass(frozen=True)
@@ -31,9 +34,7 @@ class AcceptanceCriteria:
             its end to the middle of the turn.
         slenderness_small_arc: the same for arcs up to 80 deg. The back of such an elbow is a strip about a circle of
             4 r: from end to end it measures root 2 times 4 r.
-        radius_sigma_max: greatest standard deviation of the radius, in r: with a greater one the radius lies by more
-            than half a step from the true one for half of the pipes, and the nearest standard size is most often a
-            wrong one (0.75 quantile of the normal distribution: 0.674).
+        radius_sigma_max: greatest standard deviation of the radius, in r.
         vague_radius_sigma: standard deviation of the radius, in r, from which on (as for all pipes up to THICKEST_LINE)
             a quarter of the circumference must be seen: the next size comes out in 1 % of the cases (0.99 quantile:
             2.33).
@@ -61,7 +62,7 @@ class AcceptanceCriteria:
     arc_min: float
     slenderness: float = 3.0
     slenderness_small_arc: float = 5.66
-    radius_sigma_max: float = _HALF_STEP / 0.674
+    radius_sigma_max: float = VAGUEST
     vague_radius_sigma: float = _HALF_STEP / 2.33
     vague_radius: float = THICKEST_LINE
     coverage_min: float = 0.4

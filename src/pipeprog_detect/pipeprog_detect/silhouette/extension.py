@@ -240,7 +240,7 @@ def axial_evidence(scene: Scene, at_end: bool, ahead: float) -> AxialEvidence | 
         )
 
     ahead_of = beyond(0.0, back)
-    samples, edges = ahead_of.edges(TOLERANCE, SPACING, SAMPLES)
+    samples, edges = ahead_of.own_edges(TOLERANCE, SPACING, SAMPLES)
     hit = hits(edges, scene.shift_of(samples))
     on = support_profile(samples, hit)
     along = on.along + 0.5 * (ahead - back)

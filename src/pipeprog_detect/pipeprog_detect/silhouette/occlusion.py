@@ -63,6 +63,17 @@ def visible(
     return result
 
 
+def on_contours(samples: ContourSamples, views: Sequence[View], others: Sequence[Cylinder]) -> NDArray[np.bool_]:
+    """Mask (N,) of the samples that lie on the contour of one of the `others`, whose edges they show."""
+    result = np.zeros(len(samples), bool)
+    rows = cylinder_rows(others)
+    for index, part in parts_by_view(samples, len(views)):
+        view = views[index]
+        rotation = np.ascontiguousarray(view.camera_from_map[:3, :3])
+        result[part] = _grazing(rows, view.centre, rotation, _lens(view), samples.pixel[part], MARGIN / view.camera.fx)
+    return result
+
+
 def cylinder_rows(cylinders: Sequence[Cylinder]) -> FloatArray:
     """Start, axis, length and radius (K, 8) of cylinders, for `hidden_by_cylinders`."""
     return np.array([[*each.start, *each.axis, each.length, each.radius] for each in cylinders]).reshape(-1, 8)
@@ -73,10 +84,12 @@ def hidden_by_cylinders(view: View, pixel: FloatArray, depth: FloatArray, cylind
 
     `cylinders` (K, 8): as `cylinder_rows` gives them.
     """
-    camera = view.camera
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     rotation = np.ascontiguousarray(view.camera_from_map[:3, :3])
-    return _passing(cylinders, view.centre, rotation, lens, pixel, depth, MARGIN / camera.fx)
+    return _passing(cylinders, view.centre, rotation, _lens(view), pixel, depth, MARGIN / view.camera.fx)
+
+
+def _lens(view: View) -> FloatArray:
+    return np.array([view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy])
 
 
 @njit(cache=True, nogil=True)
@@ -124,6 +137,34 @@ def _passing(
             miss = (x - depth * u) ** 2 + (y - depth * v) ** 2 + (z - depth * w) ** 2
             place = depth * along - before
             result[i] = miss < reach * reach and -reach < place < length + reach
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _grazing(
+    cylinders: FloatArray, centre: FloatArray, rotation: FloatArray, lens: FloatArray, pixel: FloatArray, margin: float
+) -> NDArray[np.bool_]:
+    """Mask (N,) of pixel (N, 2) whose lines of sight pass a cylinder's surface by less than `margin` x depth.
+
+    For the other arguments see `_passing`.
+    """
+    count = len(pixel)
+    result = np.zeros(count, np.bool_)
+    for i in range(count):
+        u, v = (pixel[i, 0] - lens[2]) / lens[0], (pixel[i, 1] - lens[3]) / lens[1]
+        ray = u * rotation[0] + v * rotation[1] + rotation[2]
+        for k in range(len(cylinders)):
+            axis, length, radius = cylinders[k, 3:6], cylinders[k, 6], cylinders[k, 7]
+            offset = cylinders[k, 0:3] - centre
+            before, along = (axis * offset).sum(), (axis * ray).sum()
+            across, aside = ray - along * axis, offset - before * axis
+            depth = (across * aside).sum() / max((across * across).sum(), 1e-12)
+            if depth <= 0.0:
+                continue
+            miss = np.sqrt(((aside - depth * across) ** 2).sum())
+            if abs(miss - radius) < margin * depth and 0.0 < depth * along - before < length:
+                result[i] = True
+                break
     return result
 
 

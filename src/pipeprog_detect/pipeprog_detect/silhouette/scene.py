@@ -27,7 +27,7 @@ from pipeprog_detect.silhouette.limb_edges import (
     least_cost,
     limb_edges,
 )
-from pipeprog_detect.silhouette.occlusion import visible
+from pipeprog_detect.silhouette.occlusion import on_contours, visible
 from pipeprog_detect.types import Cylinder, View
 
 # Length of contour [px] that makes one measurement: the mean over it averages texture, the line stays straight within.
@@ -116,6 +116,19 @@ class Scene:
     def support(self, reach: float = SUPPORT_REACH, spacing: int = SPACING, limit: int | None = None) -> SupportProfile:
         """Support of the contour by the edges within `reach` [px] of it."""
         samples, edges = self.edges(reach, spacing, limit)
+        return support_profile(samples, hits(edges, self.shift_of(samples)))
+
+    def own_edges(
+        self, reach: float, spacing: int = SPACING, limit: int | None = None
+    ) -> tuple[ContourSamples, LimbEdges]:
+        """The same without the samples on a contour of the others: an edge there may be either's."""
+        samples, edges = self.edges(reach, spacing, limit)
+        own = ~on_contours(samples, self.views, self.others)
+        return samples.select(own), edges.select(own)
+
+    def own_support(self) -> SupportProfile:
+        """Support of the contour by edges that are none of the others'."""
+        samples, edges = self.own_edges(SUPPORT_REACH)
         return support_profile(samples, hits(edges, self.shift_of(samples)))
 
     def shift_of(self, samples: ContourSamples) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud.acceptance import VAGUEST
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities
@@ -195,6 +196,7 @@ class _LineFitter:
         """
         return (
             fit.support >= least[0]
+            and fit.radius_sigma < VAGUEST * fit.cylinder.radius
             and is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
             and any(
                 abs(fit.cylinder.radius - planned) < np.hypot(REACH * fit.radius_sigma, MANUFACTURE * planned)

@@ -21,6 +21,8 @@ from pipeprog_detect.types import Cylinder, PipeEnd, View
 SLENDER = 20.0
 # Pieces of one pipe have one radius, to four standard deviations and the tolerance of manufacture (1 %, EN 10255).
 SAME_RADIUS, MANUFACTURE = 4.0, 0.01
+# Logarithm of the odds from which evidence is called decisive (Jeffreys: a hundred to one).
+DECISIVE = float(np.log(100.0))
 
 
 @dataclass(frozen=True)
@@ -127,3 +129,8 @@ def own_contours(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArra
         if Scene.of(cylinder, views, others).support().share < MIN_SUPPORT:
             kept[number] = Scene.of(cylinder, views, []).support().share < MIN_SUPPORT
     return kept
+
+
+def is_probable(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
+    """Whether edges that are none of the `others`' make it decisively more probable than texture."""
+    return float(Scene.of(cylinder, views, others).own_support().log_odds().sum()) > DECISIVE

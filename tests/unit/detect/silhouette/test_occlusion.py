@@ -8,8 +8,10 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.silhouette.occlusion import BEFORE, hidden_by_cloud, with_depths
-from pipeprog_detect.types import View
+from pipeprog_detect.silhouette.apparent_contour import contour_samples
+from pipeprog_detect.silhouette.occlusion import BEFORE, MARGIN, hidden_by_cloud, on_contours, with_depths
+from pipeprog_detect.silhouette.scene import frame
+from pipeprog_detect.types import Cylinder, View
 
 
 @pytest.fixture
@@ -63,3 +65,27 @@ def test_a_hole_in_the_cloud_of_what_hides_shows_nothing_behind_it(view: View) -
     gap = np.abs(_seen_at(view, plate)[0][:, 0] - 161.0) < 1.01  # a slit from top to bottom is one to look through
     slit = with_depths([view], np.concatenate([plate[~gap], _plate(2.0, -1.0, 1.0)]))[0]
     assert not hidden_by_cloud(slit, *_seen_at(view, behind)).any()
+
+
+@pytest.mark.parametrize("behind", [-0.2, 0.0, 0.3])
+@pytest.mark.parametrize(("beside", "shared"), [(0.0, True), (0.8 * MARGIN, True), (1.5 * MARGIN, False)])
+def test_what_lies_on_the_contour_of_another_pipe_may_be_its_edge(
+    view: View, behind: float, beside: float, shared: bool
+) -> None:
+    """A pipe and another one, three times as thick, before or behind it: they are seen in line along half of the first.
+
+    One side of the other is seen `beside` [px] one side of the pipe.
+    """
+    depth, radius = 1.2, 0.02
+    pipe = Cylinder(np.array([-0.4, 0.0, depth]), np.array([0.4, 0.0, depth]), radius)
+    samples = contour_samples(pipe, [view], frame(pipe, np.array([0.0, 0.0, 1.0])), 6.0)
+    distance = depth + behind
+    angle = np.arcsin(radius / depth) + beside / view.camera.fx - np.arcsin(3.0 * radius / distance)
+    middle = distance * np.array([0.0, np.sin(angle), np.cos(angle)])
+    half = np.array([0.2 * distance / depth, 0.0, 0.0])
+    other = Cylinder(middle - half, middle + half, 3.0 * radius)
+    found = on_contours(samples, [view], [other])
+    lower, place = samples.pixel[:, 1] > view.camera.cy, np.abs(samples.along)
+    assert (found[lower & (place < 0.17)] == shared).all()
+    assert not found[~lower | (place > 0.23)].any()
+    assert not on_contours(samples, [view], []).any()

@@ -81,3 +81,15 @@ def test_a_rod_of_another_size_is_no_thin_pipe(sigmas: float, stands: bool) -> N
     fit = ContourFit(rod, np.eye(3)[1:], np.eye(5), sigma, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
     lines = _LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
     assert lines._accepts(fit, [], (0.6, 0.0)) is stands
+
+
+@pytest.mark.parametrize(("share", "stands"), [(0.05, True), (0.15, True), (0.17, False), (0.7, False)])
+def test_what_may_have_any_radius_is_no_thin_pipe(share: float, stands: bool) -> None:
+    """Half of the radii with that standard deviation lie nearer to another standard size than to the true one."""
+    planned = 0.0086
+    boq = BillOfQuantities((PipeClass("copper 17", planned, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    line = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned)
+    fit = ContourFit(line, np.eye(3)[1:], np.eye(5), share * planned, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
+    lines = _LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
+    assert lines._accepts(fit, [], (0.6, 0.0)) is stands

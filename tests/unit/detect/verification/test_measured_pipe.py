@@ -8,8 +8,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
-from pipeprog_detect.types import Cylinder
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe, joined
+from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, joined
+from tests.unit.detect.pipe_and_wall import PIPE
 from tests.unit.detect.silhouette.test_free_space import HALF, seen, tube
 
 
@@ -84,3 +85,9 @@ def test_pieces_beside_what_hides_the_gap_are_one(gap: float) -> None:
     before = np.random.default_rng(0).uniform([-0.3, -0.25, -0.3], [0.3, -0.2, 0.3], (60_000, 3))
     tubes = [tube(-HALF, -0.5 * gap, 0.0365), tube(0.5 * gap, HALF, 0.0365)]
     assert len(joined(in_line(gap, 0.0, 0.0365, 0.0365), seen(*tubes, before))) == 1
+
+
+def test_edges_make_a_pipe_probable_unless_they_are_anothers(pipe_views: list[View], empty_views: list[View]) -> None:
+    assert is_probable(PIPE, pipe_views, [])
+    assert not is_probable(PIPE, empty_views, [])
+    assert not is_probable(PIPE, pipe_views, [PIPE])
