@@ -98,8 +98,13 @@ class Search:
     def _accepts(self, candidate: Candidate) -> bool:
         if self.around.rejects(candidate):
             return False
+        if self.criteria.accept(candidate):
+            return True
         proposed = self.criteria.relaxed(_PROPOSED_ROUGHNESS)
-        return self.criteria.accept(candidate) or (proposed.accept(candidate) and self.verifier.verify(candidate))
+        if proposed.accept(candidate):
+            return self.verifier.verify(candidate)
+        least = proposed.slenderness * candidate.cylinder.radius
+        return proposed.of_piece().accept(candidate) and self.verifier.verify(candidate, least)
 
     def _is_planned(self, candidate: Candidate) -> bool:
         """Whether its radius is within four standard deviations of a planned one."""

@@ -17,6 +17,8 @@ _HALF_SECTOR = 2.5
 # Half a step between two standard sizes, in r: from DN 15 to DN 200 the diameters of EN 10220 series 1 (21.3 to
 # 219.1 mm) rise in 11 steps, of 24 % in the geometric mean; half of ln 1.24.
 _HALF_STEP = 0.1076
+# A piece that is as long as it is wide, in r, tells the axis as well as the radius.
+_PIECE = 2.0
 # With a greater standard deviation of the radius, in r, it lies by more than half a step from the true one for half of
 # the pipes, and the nearest standard size is most often a wrong one (0.75 quantile of the normal distribution: 0.674).
 VAGUEST = _HALF_STEP / 0.674
@@ -79,6 +81,10 @@ class AcceptanceCriteria:
     def relaxed(self, roughness: float) -> AcceptanceCriteria:
         """The criteria for surfaces that may be `roughness` times as rough."""
         return replace(self, roughness=roughness)
+
+    def of_piece(self) -> AcceptanceCriteria:
+        """The criteria for a piece of a pipe of which the cloud shows no more: as long as it is wide."""
+        return replace(self, slenderness=_PIECE)
 
     def accept(self, candidate: Candidate) -> bool:
         """Whether the evidence of the cloud makes a pipe of the candidate."""

@@ -43,12 +43,15 @@ class KeyframeVerifier:
         """Whether there are keyframes."""
         return bool(self._views)
 
-    def verify(self, candidate: Candidate) -> bool:
+    def verify(self, candidate: Candidate, least_length: float = 0.0) -> bool:
         """Whether the keyframes make a pipe of a candidate that the cloud alone does not.
 
         They must support more than half of its contour, which must have a planned radius: shadows have contours, too.
         Where the cloud resolves its section and has that radius as well, any support that makes a fit suffices. Where
         it does not, a glossy pipe's highlight may be taken for its contour, unless the radius is held to a planned one.
+
+        `least_length` [m]: they must show it as long as that, however much of it the cloud has (a smooth white pipe
+        gives stereo points at its ends alone).
         """
         cylinder = candidate.cylinder
         if any(_resembles(cylinder, refused) for refused in self._refused):
@@ -61,6 +64,11 @@ class KeyframeVerifier:
         if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
             self._refused.append(cylinder)
             return False
+        if cylinder.length < least_length:
+            whole = self._fitter.fit(candidate, [], views)
+            if whole is None or whole.cylinder.length < least_length:
+                self._refused.append(cylinder)
+                return False
         return True
 
     def measure(self, candidates: Sequence[Candidate], trusted: Sequence[bool]) -> list[MeasuredPipe]:

@@ -89,6 +89,13 @@ def test_relaxed_criteria_allow_rougher_surfaces_only() -> None:
     assert not twice.accept(candidate(replace(GOOD, flatness=1.44)))
 
 
+def test_a_piece_is_as_long_as_it_is_wide() -> None:
+    piece = OUTSIDE.of_piece()
+    assert piece.accept(candidate(length=2.05 * 0.1, radius=0.1))
+    assert not piece.accept(candidate(length=1.95 * 0.1, radius=0.1))
+    assert not piece.accept(candidate(replace(GOOD, flatness=1.44), length=2.05 * 0.1, radius=0.1))
+
+
 def test_pipe_seen_from_inside_may_be_short_but_its_radius_is_known() -> None:
     inside = seen_from_inside(NOISE, DetectConfig())
     assert inside.accept(candidate(length=0.51 * 0.3, radius=0.3))

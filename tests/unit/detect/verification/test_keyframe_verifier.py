@@ -59,3 +59,20 @@ def test_the_keyframes_measure_a_pipe_unless_contours_are_disabled(pipe_views: l
     assert len(cloud_alone) == len(without) == len(measured) == 1
     assert without[0].cylinder.radius == cloud_alone[0].cylinder.radius
     assert measured[0].cylinder.radius != cloud_alone[0].cylinder.radius
+
+
+@pytest.mark.parametrize(("least", "stands"), [(0.3, True), (0.5, False)])
+def test_a_piece_stands_where_the_keyframes_show_it_longer(pipe_views: list[View], least: float, stands: bool) -> None:
+    piece = Candidate(PIPE.cut(0.1, 0.2), 5e-4, 900, CloudEvidence(np.pi, 0.9, 0.0, 1e-3, 0.0, 300.0))
+    assert KeyframeVerifier(pipe_views, BOQ).verify(piece, least) is stands
+
+
+def test_a_pipe_of_which_the_cloud_shows_a_piece_is_measured_whole(pipe_views: list[View]) -> None:
+    """Stereo sees nothing on a smooth white pipe but a stretch beside a lamp, 2.6 radii long; elbows have more."""
+    points = np.concatenate([wall_points(), front_points(PIPE.cut(0.1, 0.205))])
+    points = points + np.random.default_rng(3).normal(0.0, 5e-4, points.shape)
+    assert detect(Cloud(points), BOQ, DetectConfig()) == []
+    found = detect(Cloud(points), BOQ, DetectConfig(), pipe_views)
+    assert len(found) == 1
+    assert found[0].cylinder.length == pytest.approx(PIPE.length, abs=4e-3)
+    assert found[0].cylinder.radius == pytest.approx(PIPE.radius, abs=5e-4)
