@@ -28,6 +28,8 @@ NEAR_PLANNED, AS_GOOD = 0.15, 0.6
 # Planned radii are within reach of a candidate up to this many standard deviations, and of a fit, which adds the
 # tolerance of manufacture (1 %, EN 10255).
 REACH, MANUFACTURE = 3.0, 0.01
+# Logarithm of the odds from which evidence is called decisive (Jeffreys: a hundred to one).
+DECISIVE = float(np.log(100.0))
 # A radius with a larger standard deviation than this share of it is not told by what is seen, since sizes of pipes are
 # a tenth apart at the least (DN200 and DN225).
 TOLD = 0.03
@@ -123,16 +125,27 @@ class CandidateFitter:
     def of_visible_side(
         self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]
     ) -> ContourFit | None:
-        """The fit of a candidate of which others hide one side in all views, with the planned radius that it allows.
+        """The fit of a candidate of which others hide one side in all views, with the planned radius that it shows.
 
-        None where it allows none, or several.
-        The other side and the cloud tell its axis; the cloud alone does not tell its radius better than the plan does.
+        None where the cloud allows none, or where the keyframes do not tell it from the next planned one. The surface
+        that the cloud shows and the side that is seen tell the radius together: stereo spreads a surface outwards where
+        it is seen at a slant, and an arc seen to both its ends comes out too wide by more than its scatter says.
         Where the cloud resolves the section any support that makes a fit suffices.
         """
-        near = self._within_reach(candidate)
-        if len(near) != 1:
+        if not self._within_reach(candidate):
             return None
-        return _of_one_side(candidate, near[0], views, others)
+        radius, sigma = candidate.cylinder.radius, _sigma(candidate)
+        ranked = []
+        for planned in self._radii():
+            fit = (
+                _of_one_side(candidate, planned, views, others) if abs(planned / radius - 1.0) < NEAR_PLANNED else None
+            )
+            if fit is not None:
+                ranked.append((fit.log_odds - 0.5 * ((planned - radius) / sigma) ** 2, fit))
+        ranked.sort(key=lambda entry: -entry[0])
+        if len(ranked) > 1 and ranked[0][0] - ranked[1][0] < DECISIVE:
+            return None
+        return ranked[0][1] if ranked else None
 
     def strays(self, candidate: Candidate, fit: ContourFit) -> bool:
         """Whether the fit has a radius out of reach of the candidate's: it follows the edges of other things."""
