@@ -28,8 +28,8 @@ NEAR_PLANNED, AS_GOOD = 0.15, 0.6
 # Planned radii are within reach of a candidate up to this many standard deviations, and of a fit, which adds the
 # tolerance of manufacture (1 %, EN 10255).
 REACH, MANUFACTURE = 3.0, 0.01
-# Logarithm of the odds from which evidence is called decisive (Jeffreys: a hundred to one).
-DECISIVE = float(np.log(100.0))
+# Logarithm of the odds from which evidence for one of two planned radii is called strong (Jeffreys: ten to one).
+STRONG = float(np.log(10.0))
 # A radius with a larger standard deviation than this share of it is not told by what is seen, since sizes of pipes are
 # a tenth apart at the least (DN200 and DN225).
 TOLD = 0.03
@@ -128,22 +128,21 @@ class CandidateFitter:
         """The fit of a candidate of which others hide one side in all views, with the planned radius that it shows.
 
         None where the cloud allows none, or where the keyframes do not tell it from the next planned one. The surface
-        that the cloud shows and the side that is seen tell the radius together: stereo spreads a surface outwards where
-        it is seen at a slant, and an arc seen to both its ends comes out too wide by more than its scatter says.
+        that the cloud shows and the side that is seen tell the radius together.
         Where the cloud resolves the section any support that makes a fit suffices.
         """
-        if not self._within_reach(candidate):
-            return None
-        radius, sigma = candidate.cylinder.radius, _sigma(candidate)
+        radius, sigma = candidate.cylinder.radius, _sigma_of_arc(candidate)
         ranked = []
         for planned in self._radii():
-            fit = (
-                _of_one_side(candidate, planned, views, others) if abs(planned / radius - 1.0) < NEAR_PLANNED else None
-            )
-            if fit is not None:
-                ranked.append((fit.log_odds - 0.5 * ((planned - radius) / sigma) ** 2, fit))
+            misfit = (planned - radius) / sigma
+            if abs(misfit) < REACH and abs(planned / radius - 1.0) < NEAR_PLANNED:
+                fit = _of_one_side(candidate, planned, views, others)
+                if fit is not None:
+                    surface = _with_surface(candidate, planned, views, others)
+                    moved = float(np.linalg.norm(surface.from_axis(fit.cylinder.middle[None]))) / _sigma(candidate)
+                    ranked.append((fit.log_odds - 0.5 * (misfit**2 + moved**2), fit))
         ranked.sort(key=lambda entry: -entry[0])
-        if len(ranked) > 1 and ranked[0][0] - ranked[1][0] < DECISIVE:
+        if len(ranked) > 1 and ranked[0][0] - ranked[1][0] < STRONG:
             return None
         return ranked[0][1] if ranked else None
 
@@ -198,10 +197,25 @@ def _of_one_side(
     """The fit of a candidate of which one side is seen, with a radius that this side cannot tell; None without one."""
     sigma = _sigma(candidate)
     seen = SeenArc(candidate.evidence.arc, sigma)
-    known = with_radius(Scene.of(candidate.cylinder, views, others), seen, radius)
+    known = _with_surface(candidate, radius, views, others)
     return refine(Start(known, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
+
+
+def _with_surface(candidate: Candidate, radius: float, views: Sequence[View], others: Sequence[Cylinder]) -> Cylinder:
+    """A candidate with another radius and the surface that the cloud shows."""
+    seen = SeenArc(candidate.evidence.arc, _sigma(candidate))
+    return with_radius(Scene.of(candidate.cylinder, views, others), seen, radius)
 
 
 def _sigma(candidate: Candidate) -> float:
     """Standard deviation of the surface [m]: it may lie as far from its points' mean as these scatter."""
     return max(candidate.radius_sigma, candidate.evidence.noise)
+
+
+def _sigma_of_arc(candidate: Candidate) -> float:
+    """Standard deviation of the radius [m]: the ends of the arc may lie as far out, all along, as its points scatter.
+
+    Stereo spreads a surface outwards where it is seen at a slant: at both ends of an arc, which is then flatter.
+    """
+    noise, half = candidate.evidence.noise, 0.5 * min(candidate.evidence.arc, np.pi)
+    return float(np.hypot(candidate.radius_sigma, noise / (1.0 - np.cos(half))))

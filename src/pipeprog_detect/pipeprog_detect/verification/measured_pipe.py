@@ -16,12 +16,13 @@ from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.free_space import SHORTEST, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, PipeEnd, View
-from pipeprog_detect.verification.candidate_fit import DECISIVE
 
 # What the cloud does not resolve is no pipe if it is shorter than this many radii: hangers and clamps are.
 SLENDER = 20.0
 # Pieces of one pipe have one radius, to four standard deviations and the tolerance of manufacture (1 %, EN 10255).
 SAME_RADIUS, MANUFACTURE = 4.0, 0.01
+# Logarithm of the odds from which evidence is called decisive (Jeffreys: a hundred to one).
+DECISIVE = float(np.log(100.0))
 
 
 @dataclass(frozen=True)
