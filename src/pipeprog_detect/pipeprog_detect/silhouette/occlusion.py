@@ -108,12 +108,9 @@ def _passing(
     """
     count = len(pixel)
     result = np.zeros(count, np.bool_)
-    rays = np.empty((count, 3))
+    rays = _rays(rotation, lens, pixel)
     deepest = 0.0
     for i in range(count):
-        u, v = (pixel[i, 0] - lens[2]) / lens[0], (pixel[i, 1] - lens[3]) / lens[1]
-        for k in range(3):
-            rays[i, k] = u * rotation[0, k] + v * rotation[1, k] + rotation[2, k]
         deepest = max(deepest, own_depth[i])
     for k in range(len(cylinders)):
         ax, ay, az, length, radius = cylinders[k, 3:8]
@@ -150,22 +147,35 @@ def _grazing(
     """
     count = len(pixel)
     result = np.zeros(count, np.bool_)
-    for i in range(count):
-        u, v = (pixel[i, 0] - lens[2]) / lens[0], (pixel[i, 1] - lens[3]) / lens[1]
-        ray = u * rotation[0] + v * rotation[1] + rotation[2]
-        for k in range(len(cylinders)):
-            axis, length, radius = cylinders[k, 3:6], cylinders[k, 6], cylinders[k, 7]
-            offset = cylinders[k, 0:3] - centre
-            before, along = (axis * offset).sum(), (axis * ray).sum()
-            across, aside = ray - along * axis, offset - before * axis
-            depth = (across * aside).sum() / max((across * across).sum(), 1e-12)
-            if depth <= 0.0:
+    rays = _rays(rotation, lens, pixel)
+    for k in range(len(cylinders)):
+        ax, ay, az, length, radius = cylinders[k, 3:8]
+        x, y, z = cylinders[k, 0] - centre[0], cylinders[k, 1] - centre[1], cylinders[k, 2] - centre[2]
+        before = ax * x + ay * y + az * z
+        x, y, z = x - before * ax, y - before * ay, z - before * az
+        for i in range(count):
+            if result[i]:
                 continue
-            miss = np.sqrt(((aside - depth * across) ** 2).sum())
-            if abs(miss - radius) < margin * depth and 0.0 < depth * along - before < length:
-                result[i] = True
-                break
+            along = rays[i, 0] * ax + rays[i, 1] * ay + rays[i, 2] * az
+            u, v, w = rays[i, 0] - along * ax, rays[i, 1] - along * ay, rays[i, 2] - along * az
+            depth = (u * x + v * y + w * z) / max(u * u + v * v + w * w, 1e-12)
+            place = depth * along - before
+            if depth <= 0.0 or place <= 0.0 or place >= length:
+                continue
+            miss = np.sqrt((x - depth * u) ** 2 + (y - depth * v) ** 2 + (z - depth * w) ** 2)
+            result[i] = abs(miss - radius) < margin * depth
     return result
+
+
+@njit(cache=True, nogil=True)
+def _rays(rotation: FloatArray, lens: FloatArray, pixel: FloatArray) -> FloatArray:
+    """Lines of sight (N, 3) of pixel (N, 2) in the map, one metre deep; see `_passing`."""
+    rays = np.empty((len(pixel), 3))
+    for i in range(len(pixel)):
+        u, v = (pixel[i, 0] - lens[2]) / lens[0], (pixel[i, 1] - lens[3]) / lens[1]
+        for k in range(3):
+            rays[i, k] = u * rotation[0, k] + v * rotation[1, k] + rotation[2, k]
+    return rays
 
 
 def hidden_by_cloud(view: View, pixel: FloatArray, depth: FloatArray) -> NDArray[np.bool_]:
