@@ -260,8 +260,7 @@ def test_a_survey_goes_on_where_its_own_node_was_killed(mission: Mission, nodes:
     frames, keyframes = mission.feedback[-1].frames, mission.feedback[-1].keyframes
     nodes.kill_and_start_again("survey")
     handle = mission.send_again(survey_id="killed")  # nobody has configured it
-    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].classes)
-    assert mission.feedback[-1].frames > frames
+    mission.wait_for(lambda: any(told.classes and told.frames > frames for told in mission.feedback))
     assert mission.call(mission.end, Trigger.Request()).success
     answer = mission.result(handle)
     assert (answer.status, answer.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")
