@@ -125,15 +125,12 @@ def _passing(
         for i in range(count):
             if result[i]:
                 continue
-            along = rays[i, 0] * ax + rays[i, 1] * ay + rays[i, 2] * az
-            u, v, w = rays[i, 0] - along * ax, rays[i, 1] - along * ay, rays[i, 2] - along * az
-            depth = (u * x + v * y + w * z) / max(u * u + v * v + w * w, 1e-12)
+            depth, along, square = _approach(rays[i], (ax, ay, az), (x, y, z))
             if depth <= 0.0 or depth >= own_depth[i]:
                 continue
             reach = radius + margin * depth
-            miss = (x - depth * u) ** 2 + (y - depth * v) ** 2 + (z - depth * w) ** 2
             place = depth * along - before
-            result[i] = miss < reach * reach and -reach < place < length + reach
+            result[i] = square < reach * reach and -reach < place < length + reach
     return result
 
 
@@ -156,15 +153,26 @@ def _grazing(
         for i in range(count):
             if result[i]:
                 continue
-            along = rays[i, 0] * ax + rays[i, 1] * ay + rays[i, 2] * az
-            u, v, w = rays[i, 0] - along * ax, rays[i, 1] - along * ay, rays[i, 2] - along * az
-            depth = (u * x + v * y + w * z) / max(u * u + v * v + w * w, 1e-12)
+            depth, along, square = _approach(rays[i], (ax, ay, az), (x, y, z))
             place = depth * along - before
-            if depth <= 0.0 or place <= 0.0 or place >= length:
-                continue
-            miss = np.sqrt((x - depth * u) ** 2 + (y - depth * v) ** 2 + (z - depth * w) ** 2)
-            result[i] = abs(miss - radius) < margin * depth
+            if depth > 0.0 and 0.0 < place < length:
+                result[i] = abs(np.sqrt(square) - radius) < margin * depth
     return result
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _approach(
+    ray: FloatArray, axis: tuple[float, float, float], offset: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Where a line of sight (3,) comes nearest to an axis, `offset` straight from the camera: its depth [m].
+
+    Also what a metre of depth is along the axis, and the square of the distance there [m^2].
+    """
+    along = ray[0] * axis[0] + ray[1] * axis[1] + ray[2] * axis[2]
+    u, v, w = ray[0] - along * axis[0], ray[1] - along * axis[1], ray[2] - along * axis[2]
+    x, y, z = offset
+    depth = (u * x + v * y + w * z) / max(u * u + v * v + w * w, 1e-12)
+    return depth, along, (x - depth * u) ** 2 + (y - depth * v) ** 2 + (z - depth * w) ** 2
 
 
 @njit(cache=True, nogil=True)

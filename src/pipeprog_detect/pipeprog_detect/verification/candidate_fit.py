@@ -96,7 +96,9 @@ class CandidateFitter:
         for planned in sorted(self._radii(), key=misfit):
             if abs(planned / radius - 1.0) < NEAR_PLANNED:
                 again = _at_radius(fit.cylinder, planned, abs(planned - radius), views, others)
-                again = again or _of_one_side(replace(candidate, cylinder=fit.cylinder), planned, views, others)
+                if again is None:
+                    at_fit = replace(candidate, cylinder=fit.cylinder)
+                    again = _of_one_side(at_fit, _with_surface(at_fit, planned, views, others), views, others)
                 if again is not None and self.is_planned(again) and again.support > AS_GOOD * fit.support:
                     return again
         return fit
@@ -136,9 +138,9 @@ class CandidateFitter:
         for planned in self._radii():
             misfit = (planned - radius) / sigma
             if abs(misfit) < REACH and abs(planned / radius - 1.0) < NEAR_PLANNED:
-                fit = _of_one_side(candidate, planned, views, others)
+                surface = _with_surface(candidate, planned, views, others)
+                fit = _of_one_side(candidate, surface, views, others)
                 if fit is not None:
-                    surface = _with_surface(candidate, planned, views, others)
                     moved = float(np.linalg.norm(surface.from_axis(fit.cylinder.middle[None]))) / _sigma(candidate)
                     ranked.append((fit.log_odds - 0.5 * (misfit**2 + moved**2), fit))
         ranked.sort(key=lambda entry: -entry[0])
@@ -192,19 +194,20 @@ def _at_radius(
 
 
 def _of_one_side(
-    candidate: Candidate, radius: float, views: Sequence[View], others: Sequence[Cylinder]
+    candidate: Candidate, known: Cylinder, views: Sequence[View], others: Sequence[Cylinder]
 ) -> ContourFit | None:
-    """The fit of a candidate of which one side is seen, with a radius that this side cannot tell; None without one."""
-    sigma = _sigma(candidate)
-    seen = SeenArc(candidate.evidence.arc, sigma)
-    known = _with_surface(candidate, radius, views, others)
-    return refine(Start(known, sigma, True, ends_known=True, seen=seen, radius_fixed=True), views, others)
+    """The fit of a candidate of which one side is seen, at the radius of `known`, which this side cannot tell."""
+    start = Start(known, _sigma(candidate), True, ends_known=True, seen=_seen_arc(candidate), radius_fixed=True)
+    return refine(start, views, others)
 
 
 def _with_surface(candidate: Candidate, radius: float, views: Sequence[View], others: Sequence[Cylinder]) -> Cylinder:
     """A candidate with another radius and the surface that the cloud shows."""
-    seen = SeenArc(candidate.evidence.arc, _sigma(candidate))
-    return with_radius(Scene.of(candidate.cylinder, views, others), seen, radius)
+    return with_radius(Scene.of(candidate.cylinder, views, others), _seen_arc(candidate), radius)
+
+
+def _seen_arc(candidate: Candidate) -> SeenArc:
+    return SeenArc(candidate.evidence.arc, _sigma(candidate))
 
 
 def _sigma(candidate: Candidate) -> float:

@@ -72,9 +72,9 @@ def test_the_side_that_is_seen_tells_two_planned_radii_apart(
     cylinder = Cylinder(np.zeros(3), np.array([3.0, 0.0, 0.0]), 0.1193)
     candidate = Candidate(cylinder, 1.6e-3, 50_000, CloudEvidence(np.radians(105.0), 0.96, 0.0, 1.8e-3, 6e-4, 42.0))
 
-    def fitted(_: Candidate, radius: float, *__: object) -> ContourFit:
-        found, log_odds = replace(cylinder, radius=radius), odds if radius < 0.11 else 87.0
-        return ContourFit(found, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, log_odds, 20, (0.0, 0.0), 0.0, 0.5)
+    def fitted(_: Candidate, known: Cylinder, *__: object) -> ContourFit:
+        log_odds = odds if known.radius < 0.11 else 87.0
+        return ContourFit(known, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, log_odds, 20, (0.0, 0.0), 0.0, 0.5)
 
     monkeypatch.setattr(candidate_fit, "_of_one_side", fitted)
     monkeypatch.setattr(candidate_fit, "_with_surface", lambda _, radius, *__: replace(cylinder, radius=radius))
