@@ -88,6 +88,15 @@ def hidden_by_cylinders(view: View, pixel: FloatArray, depth: FloatArray, cylind
     return _passing(cylinders, view.centre, rotation, _lens(view), pixel, depth, MARGIN / view.camera.fx)
 
 
+def depth_of_cylinders(view: View, pixel: FloatArray, cylinders: FloatArray) -> FloatArray:
+    """Depth (N,) [m] at which the lines of sight through pixel (N, 2) meet the first cylinder; infinite: none.
+
+    `cylinders` (K, 8): as `cylinder_rows` gives them.
+    """
+    rotation = np.ascontiguousarray(view.camera_from_map[:3, :3])
+    return _first_met(cylinders, view.centre, rotation, _lens(view), pixel)
+
+
 def _lens(view: View) -> FloatArray:
     return np.array([view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy])
 
@@ -157,6 +166,30 @@ def _grazing(
             place = depth * along - before
             if depth > 0.0 and 0.0 < place < length:
                 result[i] = abs(np.sqrt(square) - radius) < margin * depth
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _first_met(
+    cylinders: FloatArray, centre: FloatArray, rotation: FloatArray, lens: FloatArray, pixel: FloatArray
+) -> FloatArray:
+    """See `depth_of_cylinders`; for the other arguments see `_passing`."""
+    count = len(pixel)
+    result = np.full(count, np.inf)
+    rays = _rays(rotation, lens, pixel)
+    for k in range(len(cylinders)):
+        ax, ay, az, length, radius = cylinders[k, 3:8]
+        x, y, z = cylinders[k, 0] - centre[0], cylinders[k, 1] - centre[1], cylinders[k, 2] - centre[2]
+        before = ax * x + ay * y + az * z
+        x, y, z = x - before * ax, y - before * ay, z - before * az
+        for i in range(count):
+            depth, along, square = _approach(rays[i], (ax, ay, az), (x, y, z))
+            if depth <= 0.0 or square >= radius * radius:
+                continue
+            across = rays[i, 0] ** 2 + rays[i, 1] ** 2 + rays[i, 2] ** 2 - along * along
+            depth -= np.sqrt((radius * radius - square) / max(across, 1e-12))
+            if depth > 0.0 and 0.0 < depth * along - before < length:
+                result[i] = min(result[i], depth)
     return result
 
 

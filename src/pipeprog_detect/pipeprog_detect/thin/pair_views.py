@@ -14,7 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, contour_samples, project
+from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, contour_samples
+from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
 from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line
 from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
 from pipeprog_detect.types import Cylinder, View
@@ -34,13 +35,24 @@ ON_OUTLINE, OUTLINE_SPACING = 2.0, 40.0
 class PairView:
     """One view at the size at which lines were sought, its segment pairs, and the depths [m] of what it sees.
 
-    `before` (N, 2): depth [m] of the cloud at the segment pairs' ends, NaN where the cloud does not show them.
+    Attributes:
+        view: the view.
+        pairs: its N segment pairs.
+        depth: least and largest depth [m].
+        before: depth (N, 2) [m] of the cloud at the pairs' ends, NaN where the cloud does not show them.
+        behind: depth (N,) [m] of the known pipe on which, or before which, a pair is seen; infinite: there is none.
     """
 
     view: View
     pairs: SegmentPairs
     depth: tuple[float, float]
     before: FloatArray
+    behind: FloatArray
+
+    def beside_pipes(self) -> PairView:
+        """The view with those segment pairs alone that no known pipe is behind."""
+        free = np.isinf(self.behind)
+        return replace(self, pairs=self.pairs.select(free), before=self.before[free], behind=self.behind[free])
 
 
 def pair_views(
@@ -56,7 +68,7 @@ def pair_views(
         views: the keyframes.
         points: of the cloud (N, 3); they bound the depths of each view.
         radii: of thin pipes [m].
-        known: cylinders in whose silhouettes no segment pairs are sought.
+        known: pipes between whose outlines no segment pairs are sought.
         edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
     # Most of the time is OpenCV's line segments, which leave the interpreter to the other threads.
@@ -103,13 +115,11 @@ def _pair_view(
     if key not in lines:
         lines[key] = straight_edges(view.image)
     found = segment_pairs(_at_the_stamp(lines[key], view, float(middle)), max(narrowest, 2.0), widest)
-    within = np.zeros(len(found), bool)
-    for cylinder in known:
-        within |= _within_silhouette(found, cylinder, view)
-    found = found.select(~within)
     found = found.select(~between_outlines(found, known, view))
     before, flat = _cloud_depths(found, pixel, depth, min(radii))
-    return PairView(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
+    found, before = found.select(~flat), before[~flat]
+    behind = depth_of_cylinders(view, found.ends.reshape(-1, 2), cylinder_rows(known)).reshape(-1, 2)
+    return PairView(view, found, (0.9 * float(near), 1.1 * float(far)), before, behind.mean(axis=1))
 
 
 def _at_the_stamp(edges: FloatArray, view: View, middle: float) -> FloatArray:
@@ -212,21 +222,6 @@ def _along(
             place[count], aside[count], there[count] = at, off, depth[i]
             count += 1
     return place[:count].copy(), aside[:count].copy(), there[:count].copy()
-
-
-def _within_silhouette(found: SegmentPairs, cylinder: Cylinder, view: View) -> NDArray[np.bool_]:
-    """Segment pairs (N,) whose both ends lie within the silhouette of a cylinder."""
-    ends, depth = project(view, np.stack([cylinder.start, cylinder.end]))
-    if (depth < 0.05).any():
-        return np.zeros(len(found), bool)
-    along = ends[1] - ends[0]
-    length = float(np.linalg.norm(along)) + 1e-9
-    along = along / length
-    offset = found.ends - ends[0]
-    place = offset @ along
-    aside = np.abs(offset @ np.array([-along[1], along[0]]))
-    reach = view.camera.fx * cylinder.radius / depth.min()
-    return np.asarray(((place > -reach) & (place < length + reach) & (aside < reach)).all(axis=1))
 
 
 def between_outlines(found: SegmentPairs, known: Sequence[Cylinder], view: View) -> NDArray[np.bool_]:

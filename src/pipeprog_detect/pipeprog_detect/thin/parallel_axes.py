@@ -118,6 +118,7 @@ class _Sights:
             spread = SURELY * WIDTH_SIGMA
             near = np.maximum(2.0 * focal * radius / (width + spread), seen.depth[0])
             far = np.minimum(2.0 * focal * radius / np.maximum(width - spread, 1e-9), seen.depth[1])
+            far = np.minimum(far, seen.behind - radius)  # before the pipe that is behind it, or touching it
             kept = (turned < SURELY * np.hypot(np.sqrt(2.0) * CENTRE_SIGMA / length, PARALLEL_SIGMA)) & (near < far)
             count = int(kept.sum())
             parts.append(
@@ -196,7 +197,8 @@ def _settled(
         sigma = np.hypot(CENTRE_SIGMA * depth / sights.focal, PARALLEL_SIGMA * lever)
         wider = 2.0 * sights.focal * sights.radius / np.maximum(depth, 1e-3) - sights.width
         agrees = (np.abs(aside) < SURELY * sigma) & (np.abs(wider) < SURELY * WIDTH_SIGMA)
-        rows = np.flatnonzero(agrees & ~used & (depth > 0.0) & (np.abs(lever) < LONGEST))
+        allowed = (depth > 0.0) & (depth < sights.depths[:, 1])
+        rows = np.flatnonzero(agrees & ~used & allowed & (np.abs(lever) < LONGEST))
         if not len(rows):
             return None
         members = rows[_best_chain(reach[rows], sights.view[rows])]

@@ -81,8 +81,16 @@ def find_thin_pipes(
     known = [measured.cylinder for measured in found]
     thin: list[MeasuredPipe] = []
 
+    def is_rival(cylinder: Cylinder) -> bool:
+        """Whether the views show it where they show a thin pipe: only one can be there."""
+        centre = mean_centre(cylinder, views)
+        narrow = [each for each in known if each.radius < thickest]
+        return centre is not None and any(covers(each, cylinder, centre, TOUCHING) for each in narrow)
+
     def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
+            return
+        if is_rival(fit.cylinder):
             return
         if not fit.is_round and is_false_line(fit.cylinder, some, walls, views, known):
             return
@@ -91,10 +99,11 @@ def find_thin_pipes(
 
     seen = pair_views(views, some, radii, known, edges)
     for parallel in propose_parallel(seen, parallel_directions(known), radii):
-        if not is_known(parallel.cylinder, known) and not _is_rival(parallel.cylinder, thin, views):
+        if not is_known(parallel.cylinder, known) and not is_rival(parallel.cylinder):
             consider(lines.along_known_pipes(parallel, known))
-    for proposed in propose(seen, some, radii, MOST_PROPOSED):
-        if not is_known(proposed, known) and not _is_rival(proposed, thin, views):
+    # Before a known pipe lines count in a known direction only: its highlights, shadows and seams look like thin pipes.
+    for proposed in propose([each.beside_pipes() for each in seen], some, radii, MOST_PROPOSED):
+        if not is_known(proposed, known) and not is_rival(proposed):
             fit = lines.measure(proposed, known, follow=False)
             consider(None if fit is None else lines.follow(fit, proposed.radius, known))
     return thin
@@ -109,12 +118,6 @@ def is_shadow(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
         and float(other.surface_distance(middle)[0]) < cylinder.radius - AXIS_SIGMA
         for other in known
     )
-
-
-def _is_rival(proposed: Cylinder, thin: Sequence[MeasuredPipe], views: Sequence[View]) -> bool:
-    """Whether the views show it where they show one of the thin pipes: only one can be there."""
-    centre = mean_centre(proposed, views)
-    return centre is not None and any(covers(each.cylinder, proposed, centre, TOUCHING) for each in thin)
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,7 @@ class _LineFitter:
 
         Its radius is what tells it from the rods of hangers: it keeps to the planned one within three sigma.
 
-        `least`: support required of the contour, and of each of its sides.
+        `least`: support required of the contour, and of each of its sides by edges that are no known pipe's.
         """
         return (
             fit.support >= least[0]
@@ -202,7 +205,7 @@ class _LineFitter:
                 abs(fit.cylinder.radius - planned) < np.hypot(REACH * fit.radius_sigma, MANUFACTURE * planned)
                 for planned in self.radii
             )
-            and Scene.of(fit.cylinder, self.views, known).support().weaker_share >= least[1]
+            and Scene.of(fit.cylinder, self.views, known).own_support().weaker_share >= least[1]
             and not fit.is_flat
         )
 

@@ -5,11 +5,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.silhouette.apparent_contour import contour_samples
-from pipeprog_detect.silhouette.occlusion import BEFORE, MARGIN, hidden_by_cloud, on_contours, with_depths
+from pipeprog_detect.silhouette.occlusion import (
+    BEFORE,
+    MARGIN,
+    cylinder_rows,
+    depth_of_cylinders,
+    hidden_by_cloud,
+    on_contours,
+    with_depths,
+)
 from pipeprog_detect.silhouette.scene import frame
 from pipeprog_detect.types import Cylinder, View
 
@@ -89,3 +99,27 @@ def test_what_lies_on_the_contour_of_another_pipe_may_be_its_edge(
     assert (found[lower & (place < 0.17)] == shared).all()
     assert not found[~lower | (place > 0.23)].any()
     assert not on_contours(samples, [view], []).any()
+
+
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.floats(0.1, 0.9), st.floats(-1.2, 1.2), st.floats(0.005, 0.15), st.floats(-1.2, 1.2), st.booleans())
+def test_a_line_of_sight_meets_the_first_surface(
+    view: View, share: float, angle: float, radius: float, slope: float, hidden: bool
+) -> None:
+    """A point on the side of a cylinder that faces the camera, with another cylinder before it or behind it."""
+    axis = np.array([np.cos(slope), 0.0, np.sin(slope)])
+    towards = np.cross(axis, [0.0, 1.0, 0.0])  # across the axis, level
+    towards *= -np.sign(towards[2])
+    start = np.array([0.0, 0.0, 1.5]) - 0.4 * axis
+    cylinder = Cylinder(start, start + 0.8 * axis, radius)
+    outward = np.cos(angle) * towards + np.sin(angle) * np.array([0.0, 1.0, 0.0])
+    point = start + share * cylinder.length * axis + radius * outward
+    assume(outward @ point < -1e-3)
+    other = Cylinder(point - 0.5 * point + [-1.0, 0.0, 0.0], point - 0.5 * point + [1.0, 0.0, 0.0], 0.01)
+    rows = cylinder_rows([cylinder, other] if hidden else [cylinder])
+    found = depth_of_cylinders(view, _seen_at(view, point[None])[0], rows)
+    if hidden:
+        assert 0.5 * point[2] - 0.02 < found[0] < 0.5 * point[2]
+    else:
+        assert found == pytest.approx(point[2], abs=1e-9)
+    assert not np.isfinite(depth_of_cylinders(view, np.array([[2.0, 2.0]]), rows)).any()

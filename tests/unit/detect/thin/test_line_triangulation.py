@@ -24,7 +24,8 @@ def cloud(*pipes: Cylinder) -> np.ndarray:
 
 
 def proposed(views: list[View], points: np.ndarray, radii: list[float], known: list[Cylinder]) -> list[Cylinder]:
-    return propose(pair_views(views, points, radii, known, {}), points, radii, 5)
+    seen = [each.beside_pipes() for each in pair_views(views, points, radii, known, {})]
+    return propose(seen, points, radii, 5)
 
 
 def test_edges_of_a_band_make_one_segment_pair() -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -59,7 +61,8 @@ def pieces(pipes: list[Cylinder], views: list[View], share: float, seed: int) ->
             ends.append(pixel + random.normal(0.0, 0.4, (2, 2)))
             widths.append(2.0 * view.camera.fx * pipe.radius / depth + random.normal(0.0, 0.5, 2))
         pairs = SegmentPairs(np.array(ends).reshape(-1, 2, 2), np.array(widths).reshape(-1, 2))
-        seen.append(PairView(view, pairs, (0.5, 3.0), np.full((len(pipes), 2), np.nan)))
+        free = np.full(len(pipes), np.inf)
+        seen.append(PairView(view, pairs, (0.5, 3.0), np.full((len(pipes), 2), np.nan), free))
     return seen
 
 
@@ -94,6 +97,18 @@ def test_pipes_side_by_side_and_in_line_stay_two(apart: float) -> None:
         for pipe in (PIPE, other):
             along = [abs(float((each.cylinder.middle - pipe.middle) @ AXIS)) for each in found]
             assert min(aside(each, pipe) + off for each, off in zip(found, along, strict=True)) < 0.2
+
+
+@pytest.mark.parametrize(("gap", "stands"), [(-0.05, False), (0.0, False), (2.5 * RADIUS, True), (0.3, True)])
+def test_what_is_seen_before_a_known_pipe_lies_before_it(gap: float, stands: bool) -> None:
+    """A pipe whose surface is `gap` [m] behind the axis; lines on it, or farther than it, are its own."""
+    views = walk((-0.5, 0.0, 0.6))
+    depth = views[0].camera_from_map[2] @ np.append(PIPE.middle, 1.0)
+    seen = [replace(each, behind=np.array([depth + gap])) for each in pieces([PIPE], views, 0.5, 1)]
+    found = propose_parallel(seen, [AXIS], [RADIUS])
+    assert any(aside(each, PIPE) < RADIUS for each in found) == stands
+    assert not any(len(each.beside_pipes().pairs) for each in seen)
+    assert all(len(each.beside_pipes().pairs) == 1 for each in pieces([PIPE], views, 0.5, 1))
 
 
 def test_other_widths_other_directions_and_few_views_propose_nothing() -> None:
