@@ -10,7 +10,8 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
-from pipeprog_detect.silhouette.extension import FARTHEST, LEAST, AxialEvidence, axial_evidence
+from pipeprog_detect.silhouette.axial_evidence import FARTHEST, AxialEvidence, axial_evidence
+from pipeprog_detect.silhouette.extension import LEAST
 from pipeprog_detect.silhouette.pipe_ends import (
     MOST_INSIDE,
     OUTSIDE,

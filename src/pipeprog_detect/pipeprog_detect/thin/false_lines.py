@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_detect.cloud.plane_segmentation import Plane
-from pipeprog_detect.silhouette.extension import STEP_AT
+from pipeprog_detect.silhouette.axial_evidence import STEP_AT
 from pipeprog_detect.silhouette.scene import SPACING, Scene
 from pipeprog_detect.thin.depth_from_cloud import is_edge_of_face
 from pipeprog_detect.types import Cylinder, View

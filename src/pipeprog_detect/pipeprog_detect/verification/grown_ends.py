@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeprog_detect.silhouette.extension import CERTAIN, LEAST, axial_evidence
+from pipeprog_detect.silhouette.axial_evidence import axial_evidence
+from pipeprog_detect.silhouette.extension import CERTAIN, LEAST
 from pipeprog_detect.silhouette.pipe_ends import find_end
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View

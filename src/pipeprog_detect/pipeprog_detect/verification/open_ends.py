@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
-from pipeprog_detect.silhouette.extension import CERTAIN, FARTHEST, LEAST, MAX_EXTENSIONS, axial_evidence
+from pipeprog_detect.silhouette.axial_evidence import FARTHEST, axial_evidence
+from pipeprog_detect.silhouette.extension import CERTAIN, LEAST, MAX_EXTENSIONS
 from pipeprog_detect.silhouette.free_space import MIN_VIEWS, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View

@@ -10,9 +10,10 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
+from pipeprog_detect.silhouette.axial_evidence import BRIGHTER, DARKER, NO_EDGE, _log_odds, axial_evidence
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.edge_support import support_profile
-from pipeprog_detect.silhouette.extension import BRIGHTER, DARKER, NO_EDGE, _log_odds, axial_evidence, extended
+from pipeprog_detect.silhouette.extension import extended
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -101,7 +102,7 @@ def _odds_of(view: IntArray, along: FloatArray, seen: IntArray, chance: float) -
     return odds
 
 
-PLACES = np.arange(-20, 20) + 0.5
+PLACES = 0.01 * (np.arange(-20, 20) + 0.5)  # m
 
 
 def test_a_view_that_never_shows_the_pipe_says_little_by_not_showing_it_farther_out() -> None:
@@ -111,7 +112,7 @@ def test_a_view_that_never_shows_the_pipe_says_little_by_not_showing_it_farther_
     one = np.concatenate([np.zeros(20, int)] * 2), np.concatenate([inner, outer])
     ended = _odds_of(*one, np.concatenate([shows, np.full(20, NO_EDGE)]), 0.2)[20:].sum()
     strange = _odds_of(np.repeat([0, 1], 20), one[1], np.concatenate([shows, np.full(20, NO_EDGE)]), 0.2)[20:].sum()
-    assert ended < -10.0
+    assert ended < -5.0
     assert -4.0 < strange < 0.0
 
 
@@ -121,6 +122,22 @@ def test_edges_that_are_brighter_and_darker_by_turns_are_texture() -> None:
     along = np.tile(PLACES, 3)
     edge = np.where(np.arange(len(along)) % 3 == 0, NO_EDGE, BRIGHTER)
     turns = np.where((along > 0) & (edge == BRIGHTER) & (np.arange(len(along)) % 2 == 0), DARKER, edge)
-    chance = 0.5
+    chance = 0.67
     assert _odds_of(view, along, edge, chance)[20:].sum() > 10.0
     assert _odds_of(view, along, turns, chance)[20:].sum() < -2.0
+
+
+@pytest.mark.parametrize("known_rate", [0.67, 1.0])
+def test_a_pipe_goes_on_where_what_is_behind_it_changes(known_rate: float) -> None:
+    """It is brighter than a wall and darker than the white pipe that follows; where it ends there are few edges."""
+    random = np.random.default_rng(0)
+    view = np.repeat(np.arange(5), len(PLACES))
+    along = np.tile(PLACES, 5)
+    shows = random.random(len(along)) < np.where(along < 0, known_rate, 0.75)
+    changes = np.where(shows, np.where(along < 0, BRIGHTER, DARKER), NO_EDGE)
+    chance = 0.2
+    assert _odds_of(view, along, changes, chance)[20:].sum() > 10.0
+    texture = random.random(len(along)) < chance
+    kinds = np.where(random.random(len(along)) < 0.5, BRIGHTER, DARKER)
+    ends = np.where(np.where(along < 0, shows, texture), np.where(along < 0, BRIGHTER, kinds), NO_EDGE)
+    assert _odds_of(view, along, ends, chance)[20:].sum() < -5.0
