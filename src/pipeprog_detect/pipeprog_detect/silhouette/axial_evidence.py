@@ -14,7 +14,8 @@ from pipeprog_detect.silhouette.edge_support import COMMON, HIT_RATE, TEXTURE, S
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder
 
-# A pipe is looked for up to this far ahead [m], and known from half of that back.
+# A known part tells the direction well enough to look this far ahead [m]. How often the pipe shows edges
+# is told by half as much of it.
 FARTHEST = 1.5
 # Spacing of the contour samples [px], and how many suffice along one end and along one line beside it.
 SPACING, SAMPLES, SAMPLES_BESIDE = 6, 2400, 600
@@ -153,7 +154,7 @@ def _with_changes(same: FloatArray, changed: FloatArray, known: int, change: flo
         same: log odds (B,) before what is behind the known positions.
         changed: log odds (B,) before anything else.
         known: number of the known positions, which come first.
-        change: probability of a change from one position to the next.
+        change: probability of a change from one position to the next; more than a half counts as that.
     """
     result = same.copy()
     change = min(change, 0.5)
