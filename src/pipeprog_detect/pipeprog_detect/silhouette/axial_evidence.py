@@ -31,8 +31,8 @@ STEP_AT = np.array([-1.5, 1.5])
 FAILING, FAILING_SEEN = 0.05, 20.0
 # Bounds of the rates: contours differ along a pipe, so that neither an edge nor its absence is ever certain evidence.
 LEAST_RATE, MOST_RATE = 0.02, 0.9
-# What is behind a pipe changes this often along it [m]: other pipes, a duct, the edge of a shadow.
-UNCHANGED = 1.0
+# What is behind a pipe changes once in this length [m]: pipes and ducts in a rack behind it are some metres long.
+UNCHANGED = 5.0
 # Samples that make a known stretch.
 MIN_SAMPLES = 10
 # The direction's error, at the end of the stretch looked at, moves the contour by less than this [px].
