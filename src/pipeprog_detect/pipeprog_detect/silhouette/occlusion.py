@@ -155,14 +155,12 @@ def _grazing(
     result = np.zeros(count, np.bool_)
     rays = _rays(rotation, lens, pixel)
     for k in range(len(cylinders)):
-        ax, ay, az, length, radius = cylinders[k, 3:8]
-        x, y, z = cylinders[k, 0] - centre[0], cylinders[k, 1] - centre[1], cylinders[k, 2] - centre[2]
-        before = ax * x + ay * y + az * z
-        x, y, z = x - before * ax, y - before * ay, z - before * az
+        axis, offset, before = _straight_to(cylinders[k], centre)
+        length, radius = cylinders[k, 6], cylinders[k, 7]
         for i in range(count):
             if result[i]:
                 continue
-            depth, along, square = _approach(rays[i], (ax, ay, az), (x, y, z))
+            depth, along, square = _approach(rays[i], axis, offset)
             place = depth * along - before
             if depth > 0.0 and 0.0 < place < length:
                 result[i] = abs(np.sqrt(square) - radius) < margin * depth
@@ -178,12 +176,10 @@ def _first_met(
     result = np.full(count, np.inf)
     rays = _rays(rotation, lens, pixel)
     for k in range(len(cylinders)):
-        ax, ay, az, length, radius = cylinders[k, 3:8]
-        x, y, z = cylinders[k, 0] - centre[0], cylinders[k, 1] - centre[1], cylinders[k, 2] - centre[2]
-        before = ax * x + ay * y + az * z
-        x, y, z = x - before * ax, y - before * ay, z - before * az
+        axis, offset, before = _straight_to(cylinders[k], centre)
+        length, radius = cylinders[k, 6], cylinders[k, 7]
         for i in range(count):
-            depth, along, square = _approach(rays[i], (ax, ay, az), (x, y, z))
+            depth, along, square = _approach(rays[i], axis, offset)
             if depth <= 0.0 or square >= radius * radius:
                 continue
             across = rays[i, 0] ** 2 + rays[i, 1] ** 2 + rays[i, 2] ** 2 - along * along
@@ -191,6 +187,20 @@ def _first_met(
             if depth > 0.0 and 0.0 < depth * along - before < length:
                 result[i] = min(result[i], depth)
     return result
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _straight_to(
+    cylinder: FloatArray, centre: FloatArray
+) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
+    """Axis of a cylinder (8,), and the way straight to the axis from a camera's centre (3,).
+
+    Also where its start lies along the axis, from the foot of that way on [m].
+    """
+    ax, ay, az = cylinder[3], cylinder[4], cylinder[5]
+    x, y, z = cylinder[0] - centre[0], cylinder[1] - centre[1], cylinder[2] - centre[2]
+    before = ax * x + ay * y + az * z
+    return (ax, ay, az), (x - before * ax, y - before * ay, z - before * az), before
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -21,8 +21,8 @@ from pipeprog_detect.types import Cylinder, PipeEnd, View
 SLENDER = 20.0
 # Pieces of one pipe have one radius, to four standard deviations and the tolerance of manufacture (1 %, EN 10255).
 SAME_RADIUS, MANUFACTURE = 4.0, 0.01
-# Logarithm of the odds from which evidence is called decisive (Jeffreys: a hundred to one), for each of the some forty
-# lines of a map that are tried (Bonferroni).
+# Logarithm of the odds from which evidence is called decisive (Jeffreys: a hundred to one), for each of the forty lines
+# of a map that are tried (Bonferroni; `thin_pipes.MOST_PROPOSED`).
 DECISIVE = float(np.log(100.0 * 40.0))
 
 
