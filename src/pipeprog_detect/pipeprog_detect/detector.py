@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,10 +21,11 @@ from pipeprog_detect.interior_search import find_concave
 from pipeprog_detect.product import classification
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.occlusion import with_depths
-from pipeprog_detect.silhouette.scene import viewing_direction
-from pipeprog_detect.thin.false_lines import is_false_line
+from pipeprog_detect.silhouette.scene import Scene, viewing_direction
+from pipeprog_detect.thin.false_lines import is_false_line, is_one_step
+from pipeprog_detect.thin.hangers import is_hanger
 from pipeprog_detect.thin.thin_pipes import find_thin_pipes
-from pipeprog_detect.types import Cloud, Pipe, View
+from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.grown_ends import with_grown_ends
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
@@ -151,14 +152,26 @@ def detect_outside(
     # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
     criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
     measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
-    measured = _without_false_lines(_genuine(measured, around, judging), prepared, judging)
+    points = prepared.points.astype(np.float32)
+
+    def is_genuine(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
+        return not is_false_line(each.cylinder, each.fit, points, around.planes, judging, others)
+
+    def is_supported(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
+        return is_probable(each.cylinder, judging, others)
+
+    def has_two_edges(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
+        return not is_one_step(Scene.of(each.cylinder, judging, others))
+
+    measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
-    lost = find_thin_pipes(prepared.points, around.planes, THICKEST_LINE, measured, judging, boq, edges)
+    lost = find_thin_pipes(prepared.points, around, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
-    measured = _probable([parallel_to_wall(each, around) for each in measured], judging)
-    whole = with_open_ends(joined(measured, judging), around, judging)
-    return _abutted(with_grown_ends(whole, judging), around, judging)
+    measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
+    whole = _judged(with_open_ends(joined(measured, judging), around, judging), judging, has_two_edges)
+    ended = _abutted(with_grown_ends(whole, judging), around, judging)
+    return [each for each in ended if not is_hanger(each, prepared.points)]
 
 
 def _candidates(
@@ -203,35 +216,20 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
     return [each for each, is_own in zip(clear, own, strict=True) if is_own]
 
 
-def _probable(measured: list[MeasuredPipe], views: Sequence[View]) -> list[MeasuredPipe]:
-    """Those that are probable now that all are known, as thin ones, along which few edges lie, may not be."""
-    if not views:
-        return measured
-    cylinders = [each.cylinder for each in measured]
-
-    def stands(number: int) -> bool:
-        each, others = cylinders[number], cylinders[:number] + cylinders[number + 1 :]
-        return each.radius >= THICKEST_LINE or is_probable(each, views, others)
-
-    return [each for number, each in enumerate(measured) if stands(number)]
-
-
-def _without_false_lines(
-    measured: list[MeasuredPipe], prepared: PreparedCloud, views: Sequence[View]
+def _judged(
+    measured: list[MeasuredPipe],
+    views: Sequence[View],
+    stands: Callable[[MeasuredPipe, Sequence[Cylinder]], bool],
 ) -> list[MeasuredPipe]:
-    """Those that are no false lines, as thin ones may be, whose section the cloud does not show."""
+    """Those that stand beside the others, as far as there are views to tell: thicker ones do by the cloud alone."""
     if not views:
         return measured
-    points, walls = prepared.points.astype(np.float32), prepared.around.planes
     cylinders = [each.cylinder for each in measured]
-
-    def is_genuine(number: int) -> bool:
-        each, others, fit = cylinders[number], cylinders[:number] + cylinders[number + 1 :], measured[number].fit
-        if each.radius >= THICKEST_LINE or (fit is not None and fit.is_round):
-            return True
-        return not is_false_line(each, points, walls, views, others)
-
-    return [each for number, each in enumerate(measured) if is_genuine(number)]
+    return [
+        each
+        for number, each in enumerate(measured)
+        if each.cylinder.radius >= THICKEST_LINE or stands(each, cylinders[:number] + cylinders[number + 1 :])
+    ]
 
 
 def _abutted(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:

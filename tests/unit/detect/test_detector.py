@@ -16,10 +16,9 @@ from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe
-from tests.unit.detect.pipe_and_wall import PIPE, wall_points
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable
+from tests.unit.detect.pipe_and_wall import PIPE
 
 CONFIG = DetectConfig()
 NOISE = 2e-3
@@ -172,19 +171,6 @@ def test_a_cloud_too_thin_to_tell_its_noise_holds_no_pipes(front_end: str) -> No
     assert detect(Cloud(clumps.reshape(-1, 3)), BOQ, DetectConfig(front_end=front_end)) == []
 
 
-@pytest.mark.parametrize(("flatness_sigma", "kept"), [(0.03, 1), (0.5, 0)])
-def test_what_the_views_show_to_be_round_is_no_edge(
-    flatness_sigma: float, kept: int, pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The cloud takes a thin pipe before a face for the edge of that face."""
-    monkeypatch.setattr(detector, "is_false_line", lambda *_: True)
-    thin = replace(PIPE, radius=0.0086)
-    fit = ContourFit(thin, np.eye(3)[1:], np.eye(5), 1e-4, 1.0, 100.0, 20, (0.0, 0.0), 0.0, flatness_sigma)
-    candidate = Candidate(thin, 1e-3, 100, CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0))
-    prepared = detector._prepare(Cloud(wall_points()), 0.1, lambda *_: None)
-    assert len(detector._without_false_lines([MeasuredPipe.of_contour(candidate, fit)], prepared, pipe_views)) == kept
-
-
 def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View], empty_views: list[View]) -> None:
     thin = PIPE.shifted(np.array([0.12, 0.0, 0.0]))
     candidates = [
@@ -192,6 +178,10 @@ def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View],
         for each in (PIPE, replace(thin, radius=0.0086))
     ]
     measured = [MeasuredPipe.of_cloud(each) for each in candidates]
-    assert detector._probable(measured, pipe_views) == measured[:1]
-    assert detector._probable(measured[:1], empty_views) == measured[:1]  # thick: the cloud shows it
-    assert detector._probable(measured, []) == measured
+
+    def judged(pipes: list[MeasuredPipe], views: list[View]) -> list[MeasuredPipe]:
+        return detector._judged(pipes, views, lambda each, others: is_probable(each.cylinder, views, others))
+
+    assert judged(measured, pipe_views) == measured[:1]
+    assert judged(measured[:1], empty_views) == measured[:1]  # thick: the cloud shows it
+    assert judged(measured, []) == measured

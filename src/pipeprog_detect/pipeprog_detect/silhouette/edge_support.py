@@ -68,9 +68,9 @@ class SupportProfile:
         return min(float((supported[expected > 0] / expected[expected > 0]).min()), 1.0) if expected.any() else 0.0
 
     def log_odds(self) -> FloatArray:
-        """Logarithm (B,) of how much more probable the edges at each position are on a pipe there than on texture."""
+        """Logarithm (B, 2) of how much more probable the edges are on a pipe than on texture, by position and side."""
         total = self.hits * EDGE + (self.seen - self.hits) * NO_EDGE
-        return np.asarray((total / (1.0 + COMMON * np.maximum(self.seen - 1.0, 0.0))).sum(axis=1))
+        return np.asarray(total / (1.0 + COMMON * np.maximum(self.seen - 1.0, 0.0)))
 
     def _by_side(self) -> tuple[FloatArray, FloatArray]:
         """Number of positions of each side (2,) with such edges, and the number expected of a real contour."""

@@ -97,7 +97,7 @@ def without_bend(known: AdjustedCylinder, start: Cylinder, prior: FloatArray) ->
 def _where_seen(known: AdjustedCylinder) -> Cylinder:
     """The stretch of a cylinder whose edges are most probable on a pipe; all of it where none are."""
     profile = support_profile(known.samples, known.hit)
-    total = np.append(0.0, np.cumsum(profile.log_odds()))
+    total = np.append(0.0, np.cumsum(profile.log_odds().sum(axis=1)))
     least = np.minimum.accumulate(total)
     last = int(np.argmax(total - least))
     first = int(np.argmin(total[: last + 1]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines that look like thin pipes and are none: edges of faces, and steps of the light between two surfaces."""
+"""Lines that look like thin pipes and are none: edges of faces, steps of the light, shadows and strips of light."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.silhouette.axial_evidence import STEP_AT
+from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.silhouette.edge_support import COMMON
 from pipeprog_detect.silhouette.scene import SPACING, Scene
 from pipeprog_detect.thin.depth_from_cloud import is_edge_of_face
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING
+from pipeprog_detect.verification.measured_pipe import DECISIVE
 
 # A step between two surfaces is one edge: beside it texture alone changes the light, on average by less than this share
 # of the step. A pipe differs from what is behind it on both sides; two surfaces of which one is as bright as the pipe
@@ -23,31 +27,93 @@ ONE_STEP = 1.0 / 8.0
 # beside the step if it goes on in the direction of the step: twice the share then. A pipe mostly differs from what lies
 # on both sides in the same direction.
 ONE_STAIR = 2.0 * ONE_STEP
+# Positions of the contour's samples over which texture averages out while what is behind a pipe stays the same.
+STRETCH = 20
+# Texture is compared along lines [px apart], of which so many samples follow the changes that are no texture.
+TEXTURE_SPACING, SLOW = 4, 25
+# Beside the contour texture is looked at behind the blur of its edge [px].
+BESIDE_EDGE = 3.0
+# Samples along a line that one speck of texture takes: what `SPACING` averages.
+SPECK = SPACING // TEXTURE_SPACING
+# Correlation of the texture of two places on one surface, half of which tells one surface from two; it is taken as no
+# less than this where shadows that cross both places hide it. And standard deviations that make a difference sure.
+SAME_SURFACE, SURELY = 0.5, 2.0
 
 
 def is_false_line(
     cylinder: Cylinder,
+    fit: ContourFit | None,
     points: NDArray[np.float32],
     walls: Sequence[Plane],
     views: Sequence[View],
     others: Sequence[Cylinder],
 ) -> bool:
-    """Whether a thin cylinder is the edge of a face in the cloud (N, 3), or one step of the light in the views.
+    """Whether a thin cylinder is the edge of a face in the cloud (N, 3), one step of the light, or a strip of it.
 
-    `walls`: planes of the cloud, whose faces have no edge where they go on.
+    What its `fit` shows to be round is no face's edge and no strip; a line of which one side is hardly seen is told to
+    be round by what is not its own. `walls`: planes of the cloud, whose faces have no edge where they go on.
     """
-    return is_edge_of_face(cylinder, points, views, walls) or is_one_step(Scene.of(cylinder, views, others))
+    scene = Scene.of(cylinder, views, others)
+    if is_one_step(scene):
+        return True
+    if fit is not None and fit.is_round:
+        return False
+    return is_edge_of_face(cylinder, points, views, walls) or is_strip_of_light(scene)
 
 
 def is_one_step(scene: Scene) -> bool:
     """Whether the light steps on one side of the contour alone, of which the other side is hardly seen."""
-    if scene.support().weaker_share >= CONVINCING:
+    support = scene.support()
+    if support.weaker_share >= CONVINCING:
         return False
     samples = scene.samples()
     light = scene.light(samples, STEP_AT, SPACING)
-    count = np.bincount(samples.side, minlength=2)
-    if not count.all():
+    if not np.bincount(samples.side, minlength=2).all():
         return False
-    outwards = np.bincount(samples.side, light[:, 0] - light[:, 1], 2) / count
-    weaker, stronger = sorted(np.abs(outwards))
-    return bool(weaker < (ONE_STAIR if outwards.prod() < 0.0 else ONE_STEP) * stronger)
+    # A pipe that goes on before something else may turn from darker to brighter: each stretch has steps of its own.
+    stretch = samples.positions()[1] // STRETCH
+    cell, count = 2 * stretch + samples.side, 2 * (int(stretch.max()) + 1)
+    number = np.bincount(cell, minlength=count).reshape(-1, 2)
+    steps = np.bincount(cell, light[:, 0] - light[:, 1], count).reshape(-1, 2)
+    weaker, stronger = sorted(np.abs(steps).sum(axis=0) / number.sum(axis=0))
+    if steps.sum(axis=0).prod() < 0.0:
+        return bool(weaker < ONE_STAIR * stronger)
+    return bool(weaker < ONE_STEP * stronger and support.log_odds().sum(axis=0).min() < DECISIVE)
+
+
+def is_strip_of_light(scene: Scene) -> bool:
+    """Whether the texture beside a thin cylinder surely goes on within it, as in a shadow or between two of them.
+
+    A pipe hides the surface behind it: its own light has nothing to do with that of the surface. Light and shadow leave
+    the texture as it is: within the strip and beside it, it agrees as it does at the same distance farther out.
+    """
+    samples = scene.samples(spacing=TEXTURE_SPACING)
+    if not len(samples):
+        return False
+    within, beyond = np.zeros((2, 3)), np.zeros((2, 3))
+    for view in np.unique(samples.view):
+        for side in (0, 1):
+            line = samples.select((samples.view == view) & (samples.side == side))
+            if len(line) < SLOW:
+                continue
+            line = line.select(np.argsort(line.along))
+            half = float(np.median(line.half_width))
+            places = np.array([-half, BESIDE_EDGE, BESIDE_EDGE + half + BESIDE_EDGE])
+            light = scene.light(line, np.add.outer(places, [-0.5, 0.0, 0.5]).ravel(), TEXTURE_SPACING)
+            light = light.reshape(len(line), 3, 3).mean(axis=2)
+            texture = light - uniform_filter1d(light, SLOW, axis=0, mode="nearest")
+            inner, beside, outer = texture.T
+            within[side] += inner @ beside, inner @ inner, beside @ beside
+            beyond[side] += beside @ outer, beside @ beside, outer @ outer
+    same = max(_correlation(beyond.sum(axis=0)), SAME_SURFACE)
+    positions = len(samples.positions()[0])
+    seen = len(samples) / (2.0 * positions)  # views of one position
+    independent = max(positions * seen / (1.0 + COMMON * max(seen - 1.0, 0.0)) / SPECK, 1.0)
+    goes_on = max(_correlation(side) for side in within)
+    return bool(goes_on - 0.5 * same > SURELY / np.sqrt(independent))
+
+
+def _correlation(sums: NDArray[np.float64]) -> float:
+    """The correlation of two signals of which the product and the squares are summed (3,); 0 where there is none."""
+    product, one, other = sums
+    return float(product / np.sqrt(one * other)) if one > 0.0 and other > 0.0 else 0.0

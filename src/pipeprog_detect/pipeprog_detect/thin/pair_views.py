@@ -40,19 +40,12 @@ class PairView:
         pairs: its N segment pairs.
         depth: least and largest depth [m].
         before: depth (N, 2) [m] of the cloud at the pairs' ends, NaN where the cloud does not show them.
-        behind: depth (N,) [m] of the known pipe on which, or before which, a pair is seen; infinite: there is none.
     """
 
     view: View
     pairs: SegmentPairs
     depth: tuple[float, float]
     before: FloatArray
-    behind: FloatArray
-
-    def beside_pipes(self) -> PairView:
-        """The view with those segment pairs alone that no known pipe is behind."""
-        free = np.isinf(self.behind)
-        return replace(self, pairs=self.pairs.select(free), before=self.before[free], behind=self.behind[free])
 
 
 def pair_views(
@@ -68,7 +61,8 @@ def pair_views(
         views: the keyframes.
         points: of the cloud (N, 3); they bound the depths of each view.
         radii: of thin pipes [m].
-        known: pipes between whose outlines no segment pairs are sought.
+        known: pipes: between their outlines and before them no segment pairs are sought, since their highlights,
+            shadows and seams look like thin pipes.
         edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
     # Most of the time is OpenCV's line segments, which leave the interpreter to the other threads.
@@ -116,10 +110,10 @@ def _pair_view(
         lines[key] = straight_edges(view.image)
     found = segment_pairs(_at_the_stamp(lines[key], view, float(middle)), max(narrowest, 2.0), widest)
     found = found.select(~between_outlines(found, known, view))
-    before, flat = _cloud_depths(found, pixel, depth, min(radii))
-    found, before = found.select(~flat), before[~flat]
     behind = depth_of_cylinders(view, found.ends.reshape(-1, 2), cylinder_rows(known)).reshape(-1, 2)
-    return PairView(view, found, (0.9 * float(near), 1.1 * float(far)), before, behind.mean(axis=1))
+    found = found.select(np.any(np.isinf(behind), axis=1))
+    before, flat = _cloud_depths(found, pixel, depth, min(radii))
+    return PairView(view, found.select(~flat), (0.9 * float(near), 1.1 * float(far)), before[~flat])
 
 
 def _at_the_stamp(edges: FloatArray, view: View, middle: float) -> FloatArray:

@@ -12,27 +12,26 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.acceptance import VAGUEST
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
-from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
+from pipeprog_detect.thin.axis_sweep import Proposal, propose_parallel
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_false_line
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
 from pipeprog_detect.thin.pair_views import pair_views
-from pipeprog_detect.thin.parallel_axes import (
+from pipeprog_detect.thin.parallel_directions import (
     LEAST_PARALLEL,
     NEARLY_PARALLEL,
     PARALLEL_SIGMA,
-    Proposal,
     parallel_directions,
-    propose_parallel,
 )
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, MANUFACTURE, REACH
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
+from pipeprog_detect.verification.scene_context import SceneContext
 
 # Proposals that are measured, and points of the cloud that bound their depths: a computing budget. More proposals than
 # a site has thin pipes cost time only.
@@ -52,7 +51,7 @@ AXIS_SIGMA = 1e-3
 
 def find_thin_pipes(
     points: NDArray[np.floating],
-    walls: Sequence[Plane],
+    around: SceneContext,
     thickest: float,
     found: Sequence[MeasuredPipe],
     views: Sequence[View],
@@ -66,7 +65,7 @@ def find_thin_pipes(
 
     Args:
         points: of the cloud (N, 3).
-        walls: its planes.
+        around: its walls.
         thickest: largest radius [m].
         found: the pipes of the cloud.
         views: the keyframes.
@@ -92,17 +91,20 @@ def find_thin_pipes(
             return
         if is_rival(fit.cylinder):
             return
-        if not fit.is_round and is_false_line(fit.cylinder, some, walls, views, known):
+        if around.touches_wall(fit.cylinder):
+            return
+        if is_false_line(fit.cylinder, fit, some, around.planes, views, known):
             return
         thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
         known.append(fit.cylinder)
 
     seen = pair_views(views, some, radii, known, edges)
-    for parallel in propose_parallel(seen, parallel_directions(known), radii):
+    swept = propose_parallel([each.view for each in seen], parallel_directions(known), radii, known)
+    before_walls = [each for each in swept if not around.touches_wall(each.cylinder)]
+    for parallel in before_walls[:MOST_PROPOSED]:
         if not is_known(parallel.cylinder, known) and not is_rival(parallel.cylinder):
             consider(lines.along_known_pipes(parallel, known))
-    # Before a known pipe lines count in a known direction only: its highlights, shadows and seams look like thin pipes.
-    for proposed in propose([each.beside_pipes() for each in seen], some, radii, MOST_PROPOSED):
+    for proposed in propose(seen, some, radii, MOST_PROPOSED):
         if not is_known(proposed, known) and not is_rival(proposed):
             fit = lines.measure(proposed, known, follow=False)
             consider(None if fit is None else lines.follow(fit, proposed.radius, known))

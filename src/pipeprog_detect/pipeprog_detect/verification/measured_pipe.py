@@ -133,5 +133,6 @@ def own_contours(cylinders: Sequence[Cylinder], views: Sequence[View]) -> NDArra
 
 
 def is_probable(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
-    """Whether edges that are none of the `others`' make it decisively more probable than texture."""
-    return float(Scene.of(cylinder, views, others).own_support().log_odds().sum()) > DECISIVE
+    """Whether edges that are none of the `others`' support both sides, decisively more often than texture would."""
+    support = Scene.of(cylinder, views, others).own_support()
+    return float(support.log_odds().sum()) > DECISIVE and support.weaker_share >= MIN_SUPPORT

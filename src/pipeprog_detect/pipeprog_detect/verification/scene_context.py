@@ -98,14 +98,30 @@ class SceneContext:
         aside, behind = offset @ sideways, offset @ depth
         bins = max(int(cylinder.length / _STEP), 4)
         place = np.clip((offset @ cylinder.axis / cylinder.length * bins).astype(np.int64), 0, bins - 1)
-        clear = 3.0 * float(np.hypot(self.sigma, radius_sigma)) + _WAVINESS
-        surface = _IN_WALL * cylinder.radius - clear
+        surface = _IN_WALL * cylinder.radius - self._clear(radius_sigma)
         buried = 0
         for step in range(bins):
             beside = (place == step) & (np.abs(aside) > cylinder.radius) & (np.abs(aside) < reach)
             flanks = [behind[beside & (side * aside > 0)] for side in (-1.0, 1.0)]
             buried += all(len(flank) >= _LEAST_POINTS and np.median(flank) < surface for flank in flanks)
         return buried > 0.5 * bins
+
+    def touches_wall(self, cylinder: Cylinder) -> bool:
+        """Whether a wall is as near to the axis as the radius, along more than half of the cylinder.
+
+        Lines on a wall, such as shadows, joints and its corner with the next one, look like a thin pipe on it.
+        """
+        nearest = cylinder.radius + self._clear(0.0)
+        offset = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, nearest)]
+        along = cylinder.along(offset)
+        near = np.linalg.norm(cylinder.from_axis(offset), axis=1) < nearest
+        near &= (along > 0.0) & (along < cylinder.length)
+        steps = max(int(cylinder.length / _STEP), 4)
+        return len(np.unique((along[near] / cylinder.length * steps).astype(np.int64))) > 0.5 * steps
+
+    def _clear(self, radius_sigma: float) -> float:
+        """By how much [m] a wall may seem to be nearer than it is: three standard deviations, and its waviness."""
+        return 3.0 * float(np.hypot(self.sigma, radius_sigma)) + _WAVINESS
 
     def _surface(self, candidate: Candidate) -> tuple[IntArray, FloatArray]:
         """Rows of the points on the cylinder's surface and the unit vectors (K, 3) from its axis to them."""

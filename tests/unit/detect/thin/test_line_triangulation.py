@@ -24,7 +24,7 @@ def cloud(*pipes: Cylinder) -> np.ndarray:
 
 
 def proposed(views: list[View], points: np.ndarray, radii: list[float], known: list[Cylinder]) -> list[Cylinder]:
-    seen = [each.beside_pipes() for each in pair_views(views, points, radii, known, {})]
+    seen = pair_views(views, points, radii, known, {})
     return propose(seen, points, radii, 5)
 
 

@@ -77,3 +77,14 @@ def test_a_pipe_that_leaves_the_wall_for_most_of_its_length_stands() -> None:
 
 def test_without_walls_nothing_is_embedded() -> None:
     assert not surroundings().is_embedded(upright(0.0, 0.0), 1e-4, AWAY)
+
+
+@pytest.mark.parametrize(("before", "touches"), [(-0.002, True), (0.0, True), (1.0, True), (1.8, False), (4.0, False)])
+def test_what_is_no_farther_from_a_wall_than_its_radius_touches_it(before: float, touches: bool) -> None:
+    """`before`: distance of the axis from the wall, in radii."""
+    assert surroundings(BACK).touches_wall(upright(0.0, -before * RADIUS)) is touches
+
+
+def test_a_pipe_that_ends_at_a_wall_does_not_touch_it() -> None:
+    beside = Cylinder(np.array([0.0, -0.8, 0.5]), np.array([0.0, 0.0, 0.5]), RADIUS)
+    assert not surroundings(BACK).touches_wall(beside)

@@ -1,0 +1,353 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Thin pipes along a known direction: of each line that a keyframe shows, all keyframes are asked at every depth.
+
+It does for axes of one direction and radius what a plane sweep (R. T. Collins, 1996) does for points: where a pipe is,
+the keyframes that see the place show edges on both of its sides, all along; elsewhere as often as texture has them. At
+every depth the same evidence is counted, so a line that has several explanations gets the one that most keyframes bear
+out, not the first one found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_detect.cloud.cylinder_fit import basis
+from pipeprog_detect.silhouette.edge_support import COMMON, HIT_RATE, MIN_VIEWS
+from pipeprog_detect.silhouette.occlusion import BEFORE
+from pipeprog_detect.thin.rectified_view import BLOCK, EDGE, UNKNOWN, RectifiedView, rectified_views
+from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.measured_pipe import DECISIVE
+
+# Where there is a pipe both sides show an edge; chance makes both do so at least this often.
+BOTH, LEAST_CHANCE = HIT_RATE**2, 0.02
+# Columns of a line that make one such stretch while its depth is sought: 24 px, 5 cm at 2 m.
+COLUMNS = 2
+# Log odds that make a line of a view: a million runs of cells begin in it (a thousand rows, widths and columns).
+LINE = float(np.log(1e6))
+# Half-widths [rows] from which on two edges are told apart, and by which the half-width of a line may be wrong.
+NARROWEST, WIDER = 1.5, 1.0
+# The nearest distance from a camera at which pipes are sought [m]: they are filmed from farther away.
+NEAREST = 0.3
+# Depths are tried in steps that move the line by two rows in a view this far away [m]: edges count within a row, and
+# the views that see a pipe lie about so far apart.
+STEP_ROWS, BASELINE = 2.0, 1.5
+# Evidence is gathered in stretches of this length [m], shorter than a clamp, up to this far from a line's middle [m].
+STRETCH, LONGEST = 0.05, 3.0
+# The largest uncertainty [m] of the distance of a line that is taken for found: two standard deviations of it are the
+# range of depths that are not decisively less probable than the best one.
+VAGUEST = 0.3
+# Lines that pass each other at less than this many radii, seen from where they are seen, are the same.
+SAME_LINE = 1.0
+# Every second view's lines are looked for at all depths: neighbours show the same ones.
+EVERY = 2
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A cylinder that may be a thin pipe, the standard deviation of its distance [m], and its log odds."""
+
+    cylinder: Cylinder
+    depth_sigma: float
+    log_odds: float
+
+
+def propose_parallel(
+    views: Sequence[View], directions: Sequence[FloatArray], radii: Sequence[float], known: Sequence[Cylinder]
+) -> list[Proposal]:
+    """Cylinders along the `directions` (3,), of the given radii [m], that several views show; most probable first.
+
+    `known`: pipes, which hide what is behind them, and whose contours are no evidence.
+    """
+    found: list[Proposal] = []
+    for direction in directions:
+        rectified = rectified_views(views, direction, known)
+        if rectified:
+            stack = _Stack.of(rectified)
+            for radius in radii:
+                found += _proposals(_swept(stack, radius), direction, radius)
+    return sorted(found, key=lambda each: -each.log_odds)
+
+
+@dataclass(frozen=True)
+class _Stack:
+    """V rectified views as arrays: `place` (V, 8), `edges` (V, R, C), `reach` (V, R / BLOCK, C); `size` (V, 2) used."""
+
+    place: FloatArray
+    size: IntArray
+    edges: NDArray[np.uint8]
+    reach: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, views: Sequence[RectifiedView]) -> _Stack:
+        size = np.array([each.edges.shape for each in views], np.int64)
+        rows, columns = size.max(axis=0)
+        edges = np.full((len(views), rows, columns), UNKNOWN, np.uint8)
+        reach = np.zeros((len(views), -(-rows // BLOCK), columns), np.float32)
+        for number, each in enumerate(views):
+            edges[number, : size[number, 0], : size[number, 1]] = each.edges
+            reach[number, : len(each.reach), : size[number, 1]] = each.reach
+        return cls(np.stack([each.place for each in views]), size, edges, reach)
+
+
+# What the columns of the axes found hold: log odds; the place across the direction (2), and from where to where along
+# it; the uncertainty of the distance; number of views that agree, and their mean centre (2 across, 1 along), all in m;
+# and the number of the line.
+_ODDS, _PLACE, _REACH, _SIGMA, _VIEWS, _CENTRE, _LINE, _COLUMNS = (
+    0,
+    slice(1, 3),
+    slice(3, 5),
+    5,
+    6,
+    slice(7, 10),
+    10,
+    11,
+)
+
+
+def _swept(stack: _Stack, radius: float) -> FloatArray:
+    """Axes (N, _COLUMNS) of cylinders of a radius [m]: for each line of every second view the most probable one."""
+    widest = int(2.0 * radius / NEAREST / stack.place[:, 4].min())
+    chance = _chances(stack.edges, stack.size, widest)
+    odds = np.stack([np.log(BOTH / chance), np.log((1.0 - BOTH) / (1.0 - chance))], axis=-1)
+    lines = []
+    for number in range(0, len(stack.place), EVERY):
+        rows, columns = stack.size[number]
+        found = _lines(stack.edges[number, :rows, :columns], odds[number], int(2.0 * NARROWEST))
+        lines.append(np.column_stack([np.full(len(found), number), found]))
+    every = np.concatenate(lines)
+    arrays = stack.place, stack.size, stack.edges, stack.reach, odds, radius
+    axes = _distinct(_at_best_depth(every, *arrays), radius)
+    # The line of one view is a piece of the pipe: all of it tells the depth better.
+    return _distinct(_at_best_depth(_whole(every[axes[:, _LINE].astype(np.int64)], axes, stack.place), *arrays), radius)
+
+
+def _whole(lines: FloatArray, axes: FloatArray, place: FloatArray) -> FloatArray:
+    """The lines (N, 6) from where to where their axes (N, _COLUMNS) reach."""
+    at = place[lines[:, 0].astype(np.int64)]
+    away = np.linalg.norm(axes[:, _PLACE] - at[:, :2], axis=1)
+    columns = (axes[:, _REACH] - at[:, 2, None]) / (away * at[:, 6])[:, None] - at[:, 5, None]
+    whole = lines.copy()
+    whole[:, 2], whole[:, 3] = np.floor(columns[:, 0]), np.ceil(columns[:, 1]) - 1.0
+    return whole
+
+
+def _distinct(axes: FloatArray, radius: float) -> FloatArray:
+    """The most probable of the axes (N, _COLUMNS) that cover each other, seen from where they are seen, best first."""
+    axes = axes[(axes[:, _ODDS] > DECISIVE) & (axes[:, _VIEWS] >= MIN_VIEWS)]
+    axes = axes[np.argsort(-axes[:, _ODDS], kind="stable")]
+    kept = np.zeros((0, _COLUMNS))
+    for one in axes:
+        centre, along = one[_CENTRE][:2], one[_CENTRE][2]
+        offset, others = one[_PLACE] - centre, kept[:, _PLACE] - centre
+        far = np.linalg.norm(others, axis=1)
+        aside = np.abs(offset[0] * others[:, 1] - offset[1] * others[:, 0]) / far
+        low, high = (one[_REACH] - along) / np.linalg.norm(offset)
+        lows, highs = ((kept[:, _REACH] - along) / far[:, None]).T
+        common = np.minimum(highs, high) > np.maximum(lows, low)
+        if not ((aside < SAME_LINE * radius) & common & (others @ offset > 0.0)).any():
+            kept = np.vstack([kept, one])
+    return kept
+
+
+def _proposals(axes: FloatArray, direction: FloatArray, radius: float) -> list[Proposal]:
+    """The axes (N, _COLUMNS) along a direction (3,) as cylinders of a radius [m], but for those of unknown depth."""
+    axes = axes[axes[:, _SIGMA] < VAGUEST]
+    feet = axes[:, _PLACE] @ np.stack(basis(direction))
+    return [
+        Proposal(Cylinder(foot + low * direction, foot + high * direction, radius), float(sigma), float(odds))
+        for foot, (low, high), sigma, odds in zip(feet, axes[:, _REACH], axes[:, _SIGMA], axes[:, _ODDS], strict=True)
+    ]
+
+
+@njit(cache=True, nogil=True)
+def _chances(edges: NDArray[np.uint8], size: IntArray, widest: int) -> FloatArray:
+    """How often (V, W) cells at each distance, in half rows up to twice the half-width `widest`, both show an edge."""
+    result = np.empty((len(edges), widest + 1))
+    for v in range(len(edges)):
+        for width in range(widest + 1):
+            low, high = width // 2, (width + 1) // 2
+            seen, both = 0, 0
+            for row in range(low, size[v, 0] - high):
+                for column in range(row % 4, size[v, 1], 4):  # a quarter of the cells tells the rate
+                    one, other = edges[v, row - low, column], edges[v, row + high, column]
+                    if one != UNKNOWN and other != UNKNOWN:
+                        seen += 1
+                        both += one == EDGE and other == EDGE
+            result[v, width] = min(max(both / max(seen, 1), LEAST_CHANCE), BOTH)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _lines(edges: NDArray[np.uint8], odds: FloatArray, narrowest: int) -> FloatArray:
+    """Runs of cells (R, C) with an edge on both sides: row, first and last column, width [half rows], log odds (N, 5).
+
+    `odds` (W, 2): log odds of a cell with both edges, and of one without, by width. Of neighbouring rows and widths
+    the best run counts.
+    """
+    rows, columns = edges.shape
+    found = [(0.0, 0.0, 0.0, 0.0, 0.0) for _ in range(0)]
+    for width in range(narrowest, len(odds)):
+        low, high = width // 2, (width + 1) // 2
+        for row in range(low, rows - high):
+            total, first, peak, last = 0.0, 0, 0.0, 0
+            for column in range(columns + 1):
+                step = -np.inf
+                if column < columns:
+                    one, other = edges[row - low, column], edges[row + high, column]
+                    if one == UNKNOWN or other == UNKNOWN:
+                        continue
+                    step = odds[width, 0] if one == EDGE and other == EDGE else odds[width, 1]
+                if total + step <= 0.0 or total + step < peak - LINE:
+                    if peak >= LINE:
+                        found.append((float(row), float(first), float(last), float(width), peak))
+                    total, peak, first = 0.0, 0.0, column + 1
+                    continue
+                total += step
+                if total > peak:
+                    peak, last = total, column
+    runs = np.empty((len(found), 5))
+    for k in range(len(found)):
+        runs[k, 0], runs[k, 1], runs[k, 2], runs[k, 3], runs[k, 4] = found[k]
+    taken = np.zeros((rows, columns), np.bool_)
+    kept = 0
+    for k in np.argsort(-runs[:, 4], kind="mergesort"):
+        row, first, last = int(runs[k, 0]), int(runs[k, 1]), int(runs[k, 2])
+        if 2 * taken[row, first : last + 1].sum() > last + 1 - first:
+            continue
+        taken[max(row - 1, 0) : row + 2, first : last + 1] = True
+        found[kept] = (float(row), float(first), float(last), runs[k, 3], runs[k, 4])
+        kept += 1
+    result = np.empty((kept, 5))
+    for k in range(kept):
+        result[k, 0], result[k, 1], result[k, 2], result[k, 3], result[k, 4] = found[k]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _weigh(
+    at: tuple[float, float, float, float],
+    total: FloatArray,
+    place: FloatArray,
+    size: IntArray,
+    edges: NDArray[np.uint8],
+    reach: NDArray[np.float32],
+    odds: FloatArray,
+    radius: float,
+) -> tuple[int, float, float, float]:
+    """Sets `total` (B,) to the log odds of a cylinder's stretches; number of views that agree, and their mean centre.
+
+    `at`: the place across the direction (2) and where the first stretch begins, and how long each is [m]; the others:
+    see `_Stack`, and `_lines` for `odds` (V, W, 2).
+    """
+    x, y, low, step = at
+    seen = np.zeros(len(total))
+    total[:] = 0.0
+    agreeing, centre_x, centre_y, centre_along = 0, 0.0, 0.0, 0.0
+    for v in range(len(place)):
+        dx, dy = x - place[v, 0], y - place[v, 1]
+        away = np.sqrt(dx * dx + dy * dy)
+        if away < NEAREST:
+            continue
+        turn = np.arctan2(dy, dx) - place[v, 3]
+        turn -= 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+        row, half = turn / place[v, 4] + place[v, 7], radius / away / place[v, 4]
+        one, other = int(np.round(row - half)), int(np.round(row + half))
+        if one < 0 or other >= size[v, 0] or half < NARROWEST:
+            continue
+        width = min(int(np.round(2.0 * half)), odds.shape[1] - 1)
+        block = min(int(row + 0.5 * BLOCK), size[v, 0] - 1) // BLOCK
+        own = 0.0
+        for b in range(len(total)):
+            column = int(np.floor((low + (b + 0.5) * step - place[v, 2]) / away / place[v, 6] - place[v, 5]))
+            if column < 0 or column >= size[v, 1] or away - radius > reach[v, block, column] + BEFORE:
+                continue
+            first, second = edges[v, one, column], edges[v, other, column]
+            if first == UNKNOWN or second == UNKNOWN:
+                continue
+            gain = odds[v, width, 0] if first == EDGE and second == EDGE else odds[v, width, 1]
+            total[b] += gain
+            seen[b] += 1.0
+            own += gain
+        if own > 0.0:
+            agreeing += 1
+            centre_x, centre_y = centre_x + place[v, 0], centre_y + place[v, 1]
+            centre_along += place[v, 2]
+    for b in range(len(total)):
+        total[b] /= 1.0 + COMMON * max(seen[b] - 1.0, 0.0)
+    share = 1.0 / max(agreeing, 1)
+    return agreeing, share * centre_x, share * centre_y, share * centre_along
+
+
+@njit(cache=True, nogil=True)
+def _at_best_depth(
+    lines: FloatArray,
+    place: FloatArray,
+    size: IntArray,
+    edges: NDArray[np.uint8],
+    reach: NDArray[np.float32],
+    odds: FloatArray,
+    radius: float,
+) -> FloatArray:
+    """The axes (N, _COLUMNS) of lines (N, 6), which are a view's number and what `_lines` gives; 0 where there is none.
+
+    For the other arguments see `_weigh`.
+    """
+    result = np.zeros((len(lines), _COLUMNS))
+    for k in range(len(lines)):
+        v, first, last = int(lines[k, 0]), int(lines[k, 2]), int(lines[k, 3])
+        width = int(lines[k, 4])
+        row = lines[k, 1] + 0.5 * (width % 2)
+        angle = place[v, 3] + (row - place[v, 7]) * place[v, 4]
+        near = (0.5 * width + WIDER) * place[v, 4] / radius  # inverse distances
+        far = max(0.5 * width - WIDER, 0.5) * place[v, 4] / radius
+        inside = min(max(first, 0), size[v, 1] - 1)
+        seen = reach[v, int(row) // BLOCK, inside : max(last, inside) + 1]
+        far = max(far, 1.0 / (seen.max() + BEFORE))
+        if far >= near:
+            continue
+        least, most = (first + place[v, 5]) * place[v, 6], (last + 1.0 + place[v, 5]) * place[v, 6]
+        tries = int((near - far) / (STEP_ROWS * place[v, 4] / BASELINE)) + 2
+        scores = np.empty(tries)
+        # As many stretches at every depth: a line that is longer because it is farther away has no more evidence.
+        best, longest, count = -1, int(2.0 * LONGEST / STRETCH), max((last + 1 - first) // COLUMNS, 3)
+        total = np.empty(max(longest, count))
+        for s in range(tries):
+            away = 1.0 / (far + (near - far) * s / (tries - 1))
+            low, length = place[v, 2] + least * away, (most - least) * away
+            at = (place[v, 0] + away * np.cos(angle), place[v, 1] + away * np.sin(angle), low, length / count)
+            _weigh(at, total[:count], place, size, edges, reach, odds, radius)
+            scores[s] = total[:count].sum()
+            if scores[s] > 0.0 and (best < 0 or scores[s] > scores[best]):
+                best = s
+        if best < 0:
+            continue
+        away = 1.0 / (far + (near - far) * best / (tries - 1))
+        nearest, farthest = away, away
+        for s in range(tries):
+            if scores[s] > scores[best] - DECISIVE:
+                other = 1.0 / (far + (near - far) * s / (tries - 1))
+                nearest, farthest = min(nearest, other), max(farthest, other)
+        x, y = place[v, 0] + away * np.cos(angle), place[v, 1] + away * np.sin(angle)
+        low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
+        result[k, 6], result[k, 7], result[k, 8], result[k, 9] = _weigh(
+            (x, y, low, STRETCH), total[:longest], place, size, edges, reach, odds, radius
+        )
+        running, begin = 0.0, 0
+        for b in range(longest):
+            if running <= 0.0:
+                running, begin = 0.0, b
+            running += total[b]
+            if running > result[k, 0]:
+                result[k, 0], result[k, 3], result[k, 4] = running, low + begin * STRETCH, low + (b + 1) * STRETCH
+        result[k, 0] *= STRETCH / (COLUMNS * place[v, 6] * away)
+        # Half of the range is two standard deviations; the next step might be as good.
+        step = STEP_ROWS * place[v, 4] / BASELINE * away**2
+        result[k, 1], result[k, 2], result[k, 5] = x, y, 0.25 * (farthest - nearest) + 0.5 * step
+        result[k, 10] = k
+    return result

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rods that hold trays, ducts and pipes: as thin as a thin pipe, from a wall or ceiling to what they carry."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeprog_detect.cloud.acceptance import THICKEST_LINE
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+
+# Rods are at most this long [m]: racks hang below a ceiling, not amid a room. Pipes of this length that come out of a
+# wall end in the open, or in a pipe.
+LONGEST = 1.0
+# What a rod carries begins within this distance of its end [m] (a clamp's or a rail's height), and is wider than the
+# rod: beyond what stereo spreads of that, two radii, this many points of the cloud lie within 3 cm of the axis. A
+# surface with a point in each square of 3 mm has two hundred in this ring; an edge crosses a quarter of it.
+REACH, WIDER, ASIDE, LEAST_POINTS = 0.08, 2.0, 0.03, 50
+
+
+def is_hanger(measured: MeasuredPipe, points: NDArray[np.floating]) -> bool:
+    """Whether a thin line runs from a wall or ceiling to a surface in the cloud (N, 3) that stands in its way."""
+    cylinder = measured.cylinder
+    if cylinder.radius >= THICKEST_LINE or cylinder.length > LONGEST:
+        return False
+    at_walls = [end.state == "wall" for end in measured.ends]
+    if sum(at_walls) != 1:
+        return False
+    end = cylinder.end if at_walls[0] else cylinder.start
+    near = points[(np.abs(points - end) < REACH + ASIDE).all(axis=1)]
+    aside = np.linalg.norm(cylinder.from_axis(near), axis=1)
+    across = (aside > WIDER * cylinder.radius) & (aside < ASIDE)
+    return int((across & (np.abs((near - end) @ cylinder.axis) < REACH)).sum()) >= LEAST_POINTS
