@@ -26,8 +26,6 @@ from pipeprog_detect.verification.measured_pipe import DECISIVE
 
 # Where there is a pipe both sides show an edge; chance makes both do so at least this often.
 BOTH, LEAST_CHANCE = HIT_RATE**2, 0.02
-# Columns of a line that make one such stretch while its depth is sought: 24 px, 5 cm at 2 m.
-COLUMNS = 2
 # Log odds that make a line of a view: a million runs of cells begin in it (a thousand rows, widths and columns).
 LINE = float(np.log(1e6))
 # Half-widths [rows] from which on two edges are told apart, and by which the half-width of a line may be wrong.
@@ -39,6 +37,9 @@ NEAREST = 0.3
 STEP_ROWS, BASELINE = 2.0, 1.5
 # Evidence is gathered in stretches of this length [m], shorter than a clamp, up to this far from a line's middle [m].
 STRETCH, LONGEST = 0.05, 3.0
+# While the depth of a line is sought a stretch is two of its columns at every depth (24 px, 5 cm at 2 m), and odds are
+# told in these: what is longer because it is farther away has no more evidence.
+COLUMNS = 2
 # The largest uncertainty [m] of the distance of a line that is taken for found: two standard deviations of it are the
 # range of depths that are not decisively less probable than the best one.
 VAGUEST = 0.3
@@ -95,19 +96,11 @@ class _Stack:
         return cls(np.stack([each.place for each in views]), size, edges, reach)
 
 
-# What the columns of the axes found hold: log odds; the place across the direction (2), and from where to where along
-# it; the uncertainty of the distance; number of views that agree, and their mean centre (2 across, 1 along), all in m;
-# and the number of the line.
-_ODDS, _PLACE, _REACH, _SIGMA, _VIEWS, _CENTRE, _LINE, _COLUMNS = (
-    0,
-    slice(1, 3),
-    slice(3, 5),
-    5,
-    6,
-    slice(7, 10),
-    10,
-    11,
-)
+# What the columns of the axes found hold: log odds; the place across the direction, and from where to where along it;
+# the uncertainty of the distance; number of views that agree, and their mean centre across the direction and along it,
+# all in m; and the number of the line.
+_ODDS, _X, _Y, _LOW, _HIGH, _SIGMA, _VIEWS, _CENTRE_X, _CENTRE_Y, _CENTRE_ALONG, _LINE = range(11)
+_PLACE, _REACH, _CENTRE, _COLUMNS = slice(_X, _Y + 1), slice(_LOW, _HIGH + 1), slice(_CENTRE_X, _CENTRE_Y + 1), 11
 
 
 def _swept(stack: _Stack, radius: float) -> FloatArray:
@@ -143,7 +136,7 @@ def _distinct(axes: FloatArray, radius: float) -> FloatArray:
     axes = axes[np.argsort(-axes[:, _ODDS], kind="stable")]
     kept = np.zeros((0, _COLUMNS))
     for one in axes:
-        centre, along = one[_CENTRE][:2], one[_CENTRE][2]
+        centre, along = one[_CENTRE], one[_CENTRE_ALONG]
         offset, others = one[_PLACE] - centre, kept[:, _PLACE] - centre
         far = np.linalg.norm(others, axis=1)
         aside = np.abs(offset[0] * others[:, 1] - offset[1] * others[:, 0]) / far
@@ -229,6 +222,12 @@ def _lines(edges: NDArray[np.uint8], odds: FloatArray, narrowest: int) -> FloatA
     return result
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _block_of(row: float, rows: int) -> int:
+    """The nearest row of `RectifiedView.reach` to one of the `rows` of a view."""
+    return min(int(row + 0.5 * BLOCK), rows - 1) // BLOCK
+
+
 @njit(cache=True, nogil=True)
 def _weigh(
     at: tuple[float, float, float, float],
@@ -261,7 +260,7 @@ def _weigh(
         if one < 0 or other >= size[v, 0] or half < NARROWEST:
             continue
         width = min(int(np.round(2.0 * half)), odds.shape[1] - 1)
-        block = min(int(row + 0.5 * BLOCK), size[v, 0] - 1) // BLOCK
+        block = _block_of(row, size[v, 0])
         own = 0.0
         for b in range(len(total)):
             column = int(np.floor((low + (b + 0.5) * step - place[v, 2]) / away / place[v, 6] - place[v, 5]))
@@ -307,14 +306,13 @@ def _at_best_depth(
         near = (0.5 * width + WIDER) * place[v, 4] / radius  # inverse distances
         far = max(0.5 * width - WIDER, 0.5) * place[v, 4] / radius
         inside = min(max(first, 0), size[v, 1] - 1)
-        seen = reach[v, int(row) // BLOCK, inside : max(last, inside) + 1]
+        seen = reach[v, _block_of(row, size[v, 0]), inside : max(last, inside) + 1]
         far = max(far, 1.0 / (seen.max() + BEFORE))
         if far >= near:
             continue
         least, most = (first + place[v, 5]) * place[v, 6], (last + 1.0 + place[v, 5]) * place[v, 6]
         tries = int((near - far) / (STEP_ROWS * place[v, 4] / BASELINE)) + 2
         scores = np.empty(tries)
-        # As many stretches at every depth: a line that is longer because it is farther away has no more evidence.
         best, longest, count = -1, int(2.0 * LONGEST / STRETCH), max((last + 1 - first) // COLUMNS, 3)
         total = np.empty(max(longest, count))
         for s in range(tries):
@@ -335,19 +333,21 @@ def _at_best_depth(
                 nearest, farthest = min(nearest, other), max(farthest, other)
         x, y = place[v, 0] + away * np.cos(angle), place[v, 1] + away * np.sin(angle)
         low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
-        result[k, 6], result[k, 7], result[k, 8], result[k, 9] = _weigh(
-            (x, y, low, STRETCH), total[:longest], place, size, edges, reach, odds, radius
-        )
+        at = (x, y, low, STRETCH)
+        agreeing, centre_x, centre_y, along = _weigh(at, total[:longest], place, size, edges, reach, odds, radius)
+        result[k, _VIEWS], result[k, _CENTRE_X], result[k, _CENTRE_Y] = agreeing, centre_x, centre_y
+        result[k, _CENTRE_ALONG] = along
         running, begin = 0.0, 0
         for b in range(longest):
             if running <= 0.0:
                 running, begin = 0.0, b
             running += total[b]
-            if running > result[k, 0]:
-                result[k, 0], result[k, 3], result[k, 4] = running, low + begin * STRETCH, low + (b + 1) * STRETCH
-        result[k, 0] *= STRETCH / (COLUMNS * place[v, 6] * away)
+            if running > result[k, _ODDS]:
+                result[k, _ODDS] = running
+                result[k, _LOW], result[k, _HIGH] = low + begin * STRETCH, low + (b + 1) * STRETCH
+        result[k, _ODDS] *= STRETCH / (COLUMNS * place[v, 6] * away)
         # Half of the range is two standard deviations; the next step might be as good.
         step = STEP_ROWS * place[v, 4] / BASELINE * away**2
-        result[k, 1], result[k, 2], result[k, 5] = x, y, 0.25 * (farthest - nearest) + 0.5 * step
-        result[k, 10] = k
+        result[k, _X], result[k, _Y], result[k, _SIGMA] = x, y, 0.25 * (farthest - nearest) + 0.5 * step
+        result[k, _LINE] = k
     return result
