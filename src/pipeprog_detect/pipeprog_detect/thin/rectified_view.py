@@ -8,14 +8,17 @@ sight gets along the direction while it gets a metre away from that line.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.cylinder_fit import basis
+from pipeprog_detect.cloud.octree import THREADS
 from pipeprog_detect.silhouette.apparent_contour import contour_samples, parts_by_view
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
 from pipeprog_detect.silhouette.scene import SPACING
@@ -63,8 +66,11 @@ def rectified_views(views: Sequence[View], direction: FloatArray, known: Sequenc
     """Those of the views that see lines along a direction (3,) from aside; `known` pipes hide what is behind them."""
     contours = _contours(views, direction, known)
     rows = cylinder_rows(known)
-    found = (_rectified(_Sight.of(view, direction), contours[number], rows) for number, view in enumerate(views))
-    return [each for each in found if each is not None]
+    sights = [_Sight.of(view, direction) for view in views]
+    # Most of it is compiled, and lets other threads run.
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = pool.map(lambda sight, lines: _rectified(sight, lines, rows), sights, contours)
+        return [each for each in found if each is not None]
 
 
 @dataclass(frozen=True)
@@ -95,15 +101,32 @@ class _Sight:
         angle = np.arctan2(plane[:, 1], plane[:, 0]) - self.facing
         return (angle + np.pi) % (2.0 * np.pi) - np.pi, ray @ self.direction / np.linalg.norm(plane, axis=1)
 
-    def pixels(self, angle: FloatArray, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def pixels(self, angle: FloatArray, slope: FloatArray) -> tuple[NDArray[np.float32], FloatArray]:
         """Pixels (R, C, 2) of angles (R,) and slopes (C,), and depths (R, C) for a metre away from the line; or NaN."""
         rotation, camera = self.view.camera_from_map[:3, :3], self.view.camera
         turn = self.facing + angle
         away = (np.cos(turn)[:, None] * self.across[0] + np.sin(turn)[:, None] * self.across[1]) @ rotation.T
-        ray = away[:, None] + slope[:, None] * (rotation @ self.direction)
-        depth = np.where(ray[..., 2] > NEAREST, ray[..., 2], np.nan)
-        pixel = ray[..., :2] / depth[..., None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        return pixel, depth
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        return _projected(away, rotation @ self.direction, slope, lens)
+
+
+@njit(cache=True, nogil=True)
+def _projected(
+    away: FloatArray, forth: FloatArray, slope: FloatArray, lens: FloatArray
+) -> tuple[NDArray[np.float32], FloatArray]:
+    """See `_Sight.pixels`: of rays `away` (R, 3) + `slope` (C,) `forth` (3,) of the camera; `lens`: fx, fy, cx, cy."""
+    pixel = np.empty((len(away), len(slope), 2), np.float32)
+    depth = np.empty((len(away), len(slope)))
+    for r in range(len(away)):
+        for c in range(len(slope)):
+            far = away[r, 2] + slope[c] * forth[2]
+            if far <= NEAREST:
+                pixel[r, c, :], depth[r, c] = np.nan, np.nan
+                continue
+            pixel[r, c, 0] = lens[0] * (away[r, 0] + slope[c] * forth[0]) / far + lens[2]
+            pixel[r, c, 1] = lens[1] * (away[r, 1] + slope[c] * forth[1]) / far + lens[3]
+            depth[r, c] = far
+    return pixel, depth
 
 
 def _rectified(sight: _Sight, contours: Sequence[FloatArray], rows: FloatArray) -> RectifiedView | None:
@@ -124,7 +147,7 @@ def _rectified(sight: _Sight, contours: Sequence[FloatArray], rows: FloatArray) 
     pixel, _ = sight.pixels(angles, slopes)
     cells, depth = sight.pixels(angles[::BLOCK], (columns + 0.5) * column_step)
     seen = _first_seen(sight.view, cells, rows)
-    edges = _edges(sight.view, _as_shown(sight.view, pixel.astype(np.float32), cells, seen))
+    edges = _edges(sight.view, _as_shown(sight.view, pixel, cells, seen))
     for line in contours:
         angle, slope = sight.angles(line)
         at = np.stack([slope / column_step - left - 0.5, angle / row_step - top], axis=1)
@@ -150,9 +173,9 @@ def _contours(views: Sequence[View], direction: FloatArray, known: Sequence[Cyli
     return lines
 
 
-def _first_seen(view: View, pixel: FloatArray, rows: FloatArray) -> FloatArray:
+def _first_seen(view: View, pixel: NDArray[np.float32], rows: FloatArray) -> FloatArray:
     """Depth (R, C) [m] of what a view shows first at pixels (R, C, 2): a known pipe or the cloud."""
-    at = np.where(np.isfinite(pixel), pixel, 0.0).reshape(-1, 2)
+    at = np.where(np.isfinite(pixel), pixel, 0.0).reshape(-1, 2).astype(float)
     depth = depth_of_cylinders(view, at, rows)
     if view.nearest is not None:
         height, width = view.nearest.shape
@@ -162,13 +185,15 @@ def _first_seen(view: View, pixel: FloatArray, rows: FloatArray) -> FloatArray:
     return depth.reshape(pixel.shape[:2])
 
 
-def _as_shown(view: View, pixel: NDArray[np.float32], cells: FloatArray, seen: FloatArray) -> NDArray[np.float32]:
+def _as_shown(
+    view: View, pixel: NDArray[np.float32], cells: NDArray[np.float32], seen: FloatArray
+) -> NDArray[np.float32]:
     """Where the image shows pixels (R, C * LINES, 2) of the stamp; by the depths `seen` (R', C) [m] at the `cells`."""
     if view.rolled is None:
         return pixel
     known = np.isfinite(seen) & np.isfinite(cells).all(axis=2)
     depth = np.where(known, seen, np.median(seen[known]) if known.any() else 1.0)
-    at = np.where(np.isfinite(cells), cells, 0.0)
+    at = np.where(np.isfinite(cells), cells, 0.0).astype(float)
     moved = (view.shown(at.reshape(-1, 2), depth.ravel()).reshape(cells.shape) - at).astype(np.float32)
     rows, columns = pixel.shape[:2]
     return np.asarray(pixel + cv2.resize(moved, (columns, rows), interpolation=cv2.INTER_LINEAR), np.float32)
@@ -176,22 +201,27 @@ def _as_shown(view: View, pixel: NDArray[np.float32], cells: FloatArray, seen: F
 
 def _edges(view: View, pixel: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Edges (R, C) along the rows of the image sampled at pixels (R, C * LINES, 2)."""
-    size = np.array([view.camera.width, view.camera.height])
-    inside = np.all((pixel > 1.0) & (pixel < size - 2.0), axis=2)
+    ends = pixel[:, ::LINES], pixel[:, LINES - 1 :: LINES]  # a cell's first and last line: the others are between them
+    missing = ~(_is_inside(view, ends[0]) & _is_inside(view, ends[1]))
     pixel = np.nan_to_num(pixel, nan=-1.0)
     light = cv2.remap(view.image, pixel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-    shape = (len(pixel), -1, LINES)
-    missing = ~np.all(inside.reshape(shape), axis=2)
+    mean = np.asarray(sum(light[:, line::LINES] for line in range(LINES)) / LINES, np.float32)
     reach = int(np.ceil(3.0 * BLUR))
     at = np.arange(-reach, reach + 1)
     gradient = -at * np.exp(-0.5 * (at / BLUR) ** 2)
-    slope = np.abs(cv2.sepFilter2D(light.reshape(shape).mean(axis=2), cv2.CV_32F, np.ones(1), gradient))
+    slope = np.abs(cv2.sepFilter2D(mean, cv2.CV_32F, np.ones(1), gradient))
     peak: NDArray[np.bool_] = np.zeros(slope.shape, bool)
     peak[1:-1] = (slope[1:-1] >= slope[:-2]) & (slope[1:-1] > slope[2:]) & ~missing[1:-1]
     if peak.any():
         peak &= slope > STRONG * np.median(slope[peak])
     near = cv2.dilate(peak.astype(np.uint8), np.ones((3, 1), np.uint8))
     return np.where(missing, UNKNOWN, np.where(near > 0, EDGE, NO_EDGE)).astype(np.uint8)
+
+
+def _is_inside(view: View, pixel: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Mask (R, C) of the pixels (R, C, 2) that lie farther than one within the image."""
+    u, v = pixel[..., 0], pixel[..., 1]
+    return np.asarray((u > 1.0) & (u < view.camera.width - 2.0) & (v > 1.0) & (v < view.camera.height - 2.0), bool)
 
 
 def _border(width: int, height: int) -> FloatArray:
