@@ -29,7 +29,8 @@ ONE_STEP = 1.0 / 8.0
 ONE_STAIR = 2.0 * ONE_STEP
 # Positions of the contour's samples over which texture averages out while what is behind a pipe stays the same.
 STRETCH = 20
-# Texture is compared along lines [px apart], of which so many samples follow the changes that are no texture.
+# Spacing of the samples along which texture is compared [px], and number of samples (100 px) whose mean follows what is
+# no texture: light that falls off, and the pipe's own shading.
 TEXTURE_SPACING, SLOW = 4, 25
 # Beside the contour texture is looked at behind the blur of its edge [px].
 BESIDE_EDGE = 3.0
