@@ -152,7 +152,7 @@ def detect_outside(
     # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
     criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
     measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
-    points = prepared.points.astype(np.float32)
+    points = (prepared.points if judging else prepared.points[:0]).astype(np.float32)  # for what is judged in the views
 
     def is_genuine(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
         return not is_false_line(each.cylinder, each.fit, points, around.planes, judging, others)
@@ -166,7 +166,7 @@ def detect_outside(
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
-    lost = find_thin_pipes(prepared.points, around, THICKEST_LINE, measured, judging, boq, edges)
+    lost = find_thin_pipes(points, around, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
     measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
     whole = _judged(with_open_ends(joined(measured, judging), around, judging), judging, has_two_edges)

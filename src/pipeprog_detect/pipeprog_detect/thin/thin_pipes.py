@@ -75,7 +75,7 @@ def find_thin_pipes(
     radii = [radius for radius in boq.radii if radius < thickest]
     if not views or not radii:
         return []
-    lines = _LineFitter(views, points.astype(np.float32), radii, boq)
+    lines = _LineFitter(views, points.astype(np.float32, copy=False), radii, boq)
     some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
     thin: list[MeasuredPipe] = []
