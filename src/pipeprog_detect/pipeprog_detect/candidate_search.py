@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_detect.cloud import axis_voting, local_shape
-from pipeprog_detect.cloud.acceptance import THICKEST_LINE, AcceptanceCriteria
+from pipeprog_detect.cloud.acceptance import HALF_STEP, THICKEST_LINE, AcceptanceCriteria
 from pipeprog_detect.cloud.axis_voting import Hypothesis
 from pipeprog_detect.cloud.candidate import Candidate, fit_candidate, own_points, refit, thin_pipe_start
 from pipeprog_detect.cloud.collinear import elbows, join, near, spanning
@@ -70,13 +70,17 @@ class Search:
 
         The `known` ones are measured again, and others sought among the points (N,) that are `fresh`. A candidate that
         the scene rejects (a corner, a hollow) is dropped; one too rough for the cloud alone is put to the keyframes.
+        Last come hypotheses to which no fit with a free radius led, at the planned radii near them.
         """
         free = np.ones(len(self.tree.points), bool)
         accepted: list[Candidate] = []
+        without_fit: list[Hypothesis] = []
 
-        def consider(hypothesis: Hypothesis) -> None:
-            candidate = fit_candidate(self.tree, free, hypothesis, self.criteria.noise)
-            if candidate is not None and self._accepts(candidate):
+        def consider(hypothesis: Hypothesis, hold_radius: bool = False) -> None:
+            candidate = fit_candidate(self.tree, free, hypothesis, self.criteria.noise, hold_radius=hold_radius)
+            if candidate is None and not hold_radius:
+                without_fit.append(hypothesis)
+            elif candidate is not None and self._accepts(candidate):
                 accepted.append(candidate)
                 cylinder = candidate.cylinder
                 reach = cylinder.radius + 3.0 * candidate.band
@@ -87,6 +91,11 @@ class Search:
         sections = self.config.front_end == "planes"
         for hypothesis in self._sections(free, planes) if sections else self._voted(fresh, free):
             consider(hypothesis)
+        if self.verifier.has_views:
+            for hypothesis in sorted(without_fit, key=lambda each: -each.votes):
+                for planned in self._at_planned_radii(hypothesis):
+                    if not any(_holds(known.cylinder, planned.cylinder) for known in accepted):
+                        consider(planned, hold_radius=True)
         self.report(0.8, "measuring")
         # Where the noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
         return [
@@ -101,10 +110,19 @@ class Search:
         if self.criteria.accept(candidate):
             return True
         proposed = self.criteria.relaxed(_PROPOSED_ROUGHNESS)
+        if candidate.radius_held:
+            return proposed.of_held_radius().accept(candidate) and self.verifier.verify(candidate)
         if proposed.accept(candidate):
             return self.verifier.verify(candidate)
         least = proposed.slenderness * candidate.cylinder.radius
         return proposed.of_piece().accept(candidate) and self.verifier.verify(candidate, least)
+
+    def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:
+        """A hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""
+        cylinder = hypothesis.cylinder
+        near = [each for each in self.planned_radii if abs(each / cylinder.radius - 1.0) < HALF_STEP]
+        near.sort(key=lambda each: abs(each - cylinder.radius))
+        return [replace(hypothesis, cylinder=replace(cylinder, radius=each)) for each in near if each > THICKEST_LINE]
 
     def _is_planned(self, candidate: Candidate) -> bool:
         """Whether its radius is within four standard deviations of a planned one."""
@@ -168,6 +186,8 @@ class Search:
         others = [other for other in others if near(other, cylinder, reach)]
         if again and len(pieces) == 1 and not others:
             return accepted[best]
+        if accepted[best].radius_held:
+            return replace(accepted[best], cylinder=cylinder)
         rows = self.tree.near_segment(cylinder.start - margin, cylinder.end + margin, reach)
         points = own_points(self.tree.points[rows], cylinder, others)
         candidate = refit(points, cylinder, band, whole=again or len(pieces) > 1)
@@ -175,3 +195,11 @@ class Search:
             return candidate
         # Where there are keyframes, they will measure it.
         return replace(accepted[best], cylinder=cylinder) if self.verifier.has_views else None
+
+
+def _holds(known: Cylinder, other: Cylinder) -> bool:
+    """Whether the middle of the other cylinder lies within a known one, or no more than its radius before its ends."""
+    middle = other.middle[None]
+    along = float(known.along(middle)[0])
+    off = float(np.linalg.norm(known.from_axis(middle)))
+    return off < known.radius and -known.radius < along < known.length + known.radius

@@ -16,12 +16,12 @@ THICKEST_LINE = 0.02
 _HALF_SECTOR = 2.5
 # Half a step between two standard sizes, in r: from DN 15 to DN 200 the diameters of EN 10220 series 1 (21.3 to
 # 219.1 mm) rise in 11 steps, of 24 % in the geometric mean; half of ln 1.24.
-_HALF_STEP = 0.1076
+HALF_STEP = 0.1076
 # A piece that is as long as it is wide, in r, tells the axis as well as the radius.
 _PIECE = 2.0
 # With a greater standard deviation of the radius, in r, it lies by more than half a step from the true one for half of
 # the pipes, and the nearest standard size is most often a wrong one (0.75 quantile of the normal distribution: 0.674).
-VAGUEST = _HALF_STEP / 0.674
+VAGUEST = HALF_STEP / 0.674
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,7 @@ class AcceptanceCriteria:
             cylinder has 5 unknowns, 2 more than a plane: by an F test on the 30 points of the least candidate 1 % of
             planes give a greater ratio (0.99 quantile of F for 2 and 25 degrees of freedom: 5.57; 1 + 2 / 25 x 5.57).
         roughness: factor on the limits of noise and roundness.
+        held_radius: whether the radius may be one that was given to the fit.
     """
 
     noise: float
@@ -65,7 +66,7 @@ class AcceptanceCriteria:
     slenderness: float = 3.0
     slenderness_small_arc: float = 5.66
     radius_sigma_max: float = VAGUEST
-    vague_radius_sigma: float = _HALF_STEP / 2.33
+    vague_radius_sigma: float = HALF_STEP / 2.33
     vague_radius: float = THICKEST_LINE
     coverage_min: float = 0.4
     intrusion_max: float = 0.15
@@ -77,6 +78,7 @@ class AcceptanceCriteria:
     roundness_floor: float = 3e-4
     flatness_min: float = 1.45
     roughness: float = 1.0
+    held_radius: bool = False
 
     def relaxed(self, roughness: float) -> AcceptanceCriteria:
         """The criteria for surfaces that may be `roughness` times as rough."""
@@ -85,6 +87,10 @@ class AcceptanceCriteria:
     def of_piece(self) -> AcceptanceCriteria:
         """The criteria for a piece of a pipe of which the cloud shows no more: as long as it is wide."""
         return replace(self, slenderness=_PIECE)
+
+    def of_held_radius(self) -> AcceptanceCriteria:
+        """The criteria where the radius was given, which leaves it open: the points fit it better than a plane."""
+        return replace(self, held_radius=True, radius_sigma_max=np.inf, vague_radius_sigma=np.inf, flatness_min=1.0)
 
     def accept(self, candidate: Candidate) -> bool:
         """Whether the evidence of the cloud makes a pipe of the candidate."""
@@ -96,7 +102,8 @@ class AcceptanceCriteria:
         noise_max = self.roughness * (self.noise_slope * self.noise + self.noise_floor)
         roundness_max = self.roundness_slope * self.noise + self.roundness_share * radius + self.roundness_floor
         return (
-            candidate.cylinder.length >= max(slenderness * radius, self.length_min)
+            (self.held_radius or not candidate.radius_held)
+            and candidate.cylinder.length >= max(slenderness * radius, self.length_min)
             and candidate.radius_sigma < self.radius_sigma_max * radius
             and evidence.arc >= arc_min
             and evidence.coverage > self.coverage_min

@@ -64,12 +64,16 @@ class CloudEvidence:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A measured cylinder, standard deviation of its radius [m], number of points on its surface, evidence."""
+    """A measured cylinder, standard deviation of its radius [m], number of points on its surface, evidence.
+
+    Where the radius is held, it is one that was given, with the standard deviation that the cloud alone would leave.
+    """
 
     cylinder: Cylinder
     radius_sigma: float
     points: int
     evidence: CloudEvidence
+    radius_held: bool = False
 
     @property
     def blurred(self) -> bool:
@@ -81,12 +85,25 @@ class Candidate:
         """Width [m] that counts as one standard deviation when points are taken for its surface."""
         return _band(self.evidence.noise, _OWN_BAND)
 
+    @property
+    def arc_sigma(self) -> float:
+        """Standard deviation of the radius [m] where the ends of the arc may lie as far out as its points scatter.
 
-def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma: float) -> Candidate | None:
+        Stereo spreads a surface outwards where it is seen at a slant: at both ends of an arc, which is then flatter.
+        """
+        if self.radius_held:
+            return self.radius_sigma
+        return float(np.hypot(self.radius_sigma, _spread_of_arc(self.evidence)))
+
+
+def fit_candidate(
+    tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis, sigma: float, *, hold_radius: bool = False
+) -> Candidate | None:
     """Fit a hypothesis to the points of the tree that are free (N,), and follow it along its axis to its ends.
 
     Only the sector that voted for it is fitted: beside it a neighbour may begin, which is not known yet.
     sigma [m] is the cloud's typical noise; a pipe's own may be up to 1.6 times that (head-on surfaces, waviness).
+    Its radius may be held, where the cloud does not tell it.
     """
     wide = _band(sigma, _START_BAND)
     initial = cylinder = hypothesis.cylinder
@@ -111,7 +128,7 @@ def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis,
             cylinder = cylinder.cut(low, high)
             points = _between(points, cylinder, Interval(0.0, cylinder.length))
         facing = _spread_out(_facing(points, cylinder, hypothesis.sector), _FIT_POINTS)
-        fit = quick_fit(facing, cylinder, wide, reach)
+        fit = quick_fit(facing, cylinder, wide, reach, free_radius=not hold_radius)
         if fit is None or not 0.6 * initial.radius < fit[0].radius < 1.6 * initial.radius:
             return None
         fitted, rmse = fit
@@ -121,27 +138,34 @@ def fit_candidate(tree: Octree, free: NDArray[np.bool_], hypothesis: Hypothesis,
             break
     margin = cylinder.radius * cylinder.axis
     rows = tree.near_segment(cylinder.start - margin, cylinder.end + margin, 1.5 * cylinder.radius + 6.0 * wide)
-    return refit(tree.points[rows[free[rows]]], cylinder, wide, sector=hypothesis.sector)
+    return refit(tree.points[rows[free[rows]]], cylinder, wide, sector=hypothesis.sector, hold_radius=hold_radius)
 
 
 def refit(
-    points: FloatArray, cylinder: Cylinder, wide: float, whole: bool = False, sector: Sector | None = None
+    points: FloatArray,
+    cylinder: Cylinder,
+    wide: float,
+    *,
+    whole: bool = False,
+    sector: Sector | None = None,
+    hold_radius: bool = False,
 ) -> Candidate | None:
     """Measure a cylinder that is nearly right on the points (N, 3) around it, all of which are its own or nobody's.
 
     Points within three times `wide` [m] are its surface. A `whole` cylinder is known to be one pipe between its ends,
     whatever the gaps; otherwise it is followed as far as it is straight and its gaps are such as a clamp explains.
-    Where a sector is given, only that is fitted.
+    Where a sector is given, only that is fitted. Its radius may be held.
     """
     near = points[np.abs(_signed_distance(points, cylinder)) < max(5.0 * wide, 0.2 * cylinder.radius)]
     # A cap closes the end: its points lie within the barrel all around, and would draw the radius in.
     body = _facing(_between(near, cylinder, _without_caps(cylinder, wide)), cylinder, sector)
-    fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), cylinder, wide, reach=1.0)
+    held = cylinder.radius if hold_radius else None
+    fit = fit_cylinder(_spread_out(body, _FINAL_POINTS), cylinder, wide, reach=1.0, fixed_radius=held)
     if fit is None:
         return None
     # What the residuals do not show: third orders of the noise, and a bend of the cloud that is alike all along.
     radius_sigma = float(np.linalg.norm([fit.radius_sigma, 0.5 * fit.rmse**2 / fit.cylinder.radius, _BENT_CLOUD]))
-    if fit.rmse > _BLURRED * cylinder.radius:
+    if fit.rmse > _BLURRED * cylinder.radius and not hold_radius:
         fit, radius_sigma = _by_width(body, cylinder, fit, wide)
     cylinder = fit.cylinder.cut_like(cylinder)
     intervals = _covered_intervals(near, cylinder, wide) if whole else _visible_intervals(near, cylinder, wide)
@@ -153,7 +177,10 @@ def refit(
     if len(_between(surface, cut, _without_caps(cut, wide))) < _LEAST_POINTS:
         return None
     coverage = sum(interval.length for interval in intervals) / cut.length
-    return Candidate(cut, radius_sigma, len(surface), _evidence(points, cut, surface, wide, coverage))
+    evidence = _evidence(points, cut, surface, wide, coverage)
+    if hold_radius:
+        radius_sigma = float(np.hypot(radius_sigma, _spread_of_arc(evidence)))
+    return Candidate(cut, radius_sigma, len(surface), evidence, hold_radius)
 
 
 def thin_pipe_start(
@@ -241,6 +268,11 @@ def _evidence(
         roundness=_roundness(surface, cylinder, distance),
         flatness=float(values[1]) / max(square, 1e-12),
     )
+
+
+def _spread_of_arc(evidence: CloudEvidence) -> float:
+    """By how much the radius changes [m] where both ends of the arc move out by what the points scatter."""
+    return float(evidence.noise / (1.0 - np.cos(0.5 * min(evidence.arc, np.pi))))
 
 
 def _roundness(points: FloatArray, cylinder: Cylinder, distance: FloatArray, sectors: int = 36) -> float:

@@ -101,13 +101,15 @@ def fit_cylinder(
     return CylinderFit(cylinder, covariance, rmse, inliers)
 
 
-def quick_fit(points: FloatArray, initial: Cylinder, sigma: float, reach: float) -> tuple[Cylinder, float] | None:
+def quick_fit(
+    points: FloatArray, initial: Cylinder, sigma: float, reach: float, *, free_radius: bool = True
+) -> tuple[Cylinder, float] | None:
     """The cylinder that `fit_cylinder` starts from, with noise of `sigma` [m] all around, and its inliers' rmse [m]."""
     if len(points) < 10 or not sigma > 0:
         return None
     tensor = sigma**2 * np.eye(3)
     ok, centre, axis, radius = _iterate(
-        points, initial.middle, initial.axis, initial.radius, tensor, reach, True, False
+        points, initial.middle, initial.axis, initial.radius, tensor, reach, free_radius, False
     )
     if not ok or not np.isfinite(centre).all() or radius <= 0:
         return None

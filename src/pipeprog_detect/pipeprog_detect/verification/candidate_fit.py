@@ -131,9 +131,10 @@ class CandidateFitter:
 
         None where the cloud allows none, or where the keyframes do not tell it from the next planned one. The surface
         that the cloud shows and the side that is seen tell the radius together.
-        Where the cloud resolves the section any support that makes a fit suffices.
+        Where the cloud resolves the section any support that makes a fit suffices. Where the radius was given to the
+        cloud, more than half of the contour must be supported, where the surface allows it.
         """
-        radius, sigma = candidate.cylinder.radius, _sigma_of_arc(candidate)
+        radius, sigma = candidate.cylinder.radius, candidate.arc_sigma
         ranked = []
         for planned in self._radii():
             misfit = (planned - radius) / sigma
@@ -142,6 +143,8 @@ class CandidateFitter:
                 fit = _of_one_side(candidate, surface, views, others)
                 if fit is not None:
                     moved = float(np.linalg.norm(surface.from_axis(fit.cylinder.middle[None]))) / _sigma(candidate)
+                    if candidate.radius_held and not (moved < REACH and fit.support > CONVINCING):
+                        continue
                     ranked.append((fit.log_odds - 0.5 * (misfit**2 + moved**2), fit))
         ranked.sort(key=lambda entry: -entry[0])
         if len(ranked) > 1 and ranked[0][0] - ranked[1][0] < STRONG:
@@ -213,12 +216,3 @@ def _seen_arc(candidate: Candidate) -> SeenArc:
 def _sigma(candidate: Candidate) -> float:
     """Standard deviation of the surface [m]: it may lie as far from its points' mean as these scatter."""
     return max(candidate.radius_sigma, candidate.evidence.noise)
-
-
-def _sigma_of_arc(candidate: Candidate) -> float:
-    """Standard deviation of the radius [m]: the ends of the arc may lie as far out, all along, as its points scatter.
-
-    Stereo spreads a surface outwards where it is seen at a slant: at both ends of an arc, which is then flatter.
-    """
-    noise, half = candidate.evidence.noise, 0.5 * min(candidate.evidence.arc, np.pi)
-    return float(np.hypot(candidate.radius_sigma, noise / (1.0 - np.cos(half))))

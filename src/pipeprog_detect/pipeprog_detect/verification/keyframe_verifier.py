@@ -50,12 +50,16 @@ class KeyframeVerifier:
         Where the cloud resolves its section and has that radius as well, any support that makes a fit suffices. Where
         it does not, a glossy pipe's highlight may be taken for its contour, unless the radius is held to a planned one.
 
+        A candidate whose radius was held is verified by the side that they show of it.
+
         `least_length` [m]: they must show it as long as that, however much of it the cloud has (a smooth white pipe
         gives stereo points at its ends alone).
         """
         cylinder = candidate.cylinder
         if any(_resembles(cylinder, refused) for refused in self._refused):
             return False
+        if candidate.radius_held:
+            return self._fitter.of_visible_side(candidate, [], self._views) is not None
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
         fit = self._fitter.fit(candidate, [], views, follow=False)
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
@@ -119,7 +123,7 @@ class KeyframeVerifier:
         if not self.has_views:
             return MeasuredPipe.of_cloud(candidate) if trusted else None
         fit = self._fitter.fit(candidate, others, self._views, trusted=trusted)
-        if fit is None and not trusted and is_resolved(candidate):
+        if fit is None and not trusted and (candidate.radius_held or is_resolved(candidate)):
             fit = self._fitter.of_visible_side(candidate, others, self._views)
         if fit is None and not (trusted and is_resolved(candidate)):
             return None
@@ -130,7 +134,9 @@ class KeyframeVerifier:
                 fit = self._fitter.of_planned_radius(candidate, others, self._views)
             elif self._fitter.strays(candidate, fit):
                 fit = self._fitter.of_planned_radius(candidate, others, self._views) or fit
-            if fit is None or (candidate.blurred and not self._stands_alone(fit.cylinder, others)):
+            if fit is None or (candidate.blurred and is_stub(fit.cylinder)):
+                return None
+            if (candidate.blurred or candidate.radius_held) and not self._shows_both_sides(fit.cylinder, others):
                 return None
         else:
             fit = self._fitter.near_planned(candidate, fit, others, self._views)
@@ -140,10 +146,8 @@ class KeyframeVerifier:
             return MeasuredPipe.between_ends_of(candidate, fit)
         return MeasuredPipe.of_contour(candidate, fit)
 
-    def _stands_alone(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
-        """Whether the keyframes alone make a pipe of it: no stub, both sides seen (a board or a step shows one)."""
-        if is_stub(cylinder):
-            return False
+    def _shows_both_sides(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
+        """Whether it has edges on each side that is not hidden: a board or a step has them on one."""
         return Scene.of(cylinder, self._views, others).support().weaker_share >= MIN_SUPPORT
 
 

@@ -96,6 +96,14 @@ def test_a_piece_is_as_long_as_it_is_wide() -> None:
     assert not piece.accept(candidate(replace(GOOD, flatness=1.44), length=2.05 * 0.1, radius=0.1))
 
 
+def test_of_a_held_radius_only_the_surface_is_judged() -> None:
+    held = replace(candidate(replace(GOOD, flatness=1.01), sigma=0.2), radius_held=True)
+    assert OUTSIDE.of_held_radius().accept(held)
+    assert not OUTSIDE.of_held_radius().accept(replace(held, evidence=replace(GOOD, flatness=0.99)))
+    # It is not the cloud that tells the radius, however well the points fit.
+    assert not OUTSIDE.accept(replace(candidate(), radius_held=True))
+
+
 def test_pipe_seen_from_inside_may_be_short_but_its_radius_is_known() -> None:
     inside = seen_from_inside(NOISE, DetectConfig())
     assert inside.accept(candidate(length=0.51 * 0.3, radius=0.3))

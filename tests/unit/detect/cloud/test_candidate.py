@@ -42,3 +42,25 @@ def test_wall_behind_the_pipe_does_not_draw_the_radius(radius: float, noise: flo
     # Fitted to the whole circumference the thin ones err by 3 and 4 mm.
     assert abs(np.mean(errors)) < 0.2e-3
     assert np.sqrt(np.mean(np.square(errors))) < 0.1 * noise + 0.1e-3
+
+
+def test_where_both_ends_of_an_arc_lie_too_far_out_the_radius_can_be_held() -> None:
+    """Stereo spreads the ends of 75 deg of a DN100 outwards by 6 mm: its points agree with a plane as with a pipe."""
+    radius, half, noise = 0.0575, np.radians(37.5), 1e-3
+    start = Cylinder(np.array([0.0, 0.0, -0.5]), np.array([0.0, 0.0, 0.5]), radius)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        angle = rng.uniform(-half, half, 3000)
+        seen = radius + 6e-3 * (angle / half) ** 4
+        points = np.stack([seen * np.cos(angle), seen * np.sin(angle), rng.uniform(-0.5, 0.5, 3000)], axis=1)
+        tree = octree.build(points + rng.normal(0.0, noise, points.shape))
+        free = np.ones(len(points), bool)
+        assert fit_candidate(tree, free, Hypothesis(start, 9), noise) is None
+        held = fit_candidate(tree, free, Hypothesis(start, 9), noise, hold_radius=True)
+        assert held is not None
+        assert held.radius_held
+        assert held.cylinder.radius == radius
+        assert np.linalg.norm(held.cylinder.middle[:2]) < noise
+        assert held.cylinder.length == pytest.approx(1.0, abs=0.02)
+        # The radius is not told: the ends of the arc may lie out by 1.8 mm all along, a fifth of which is the sagitta.
+        assert held.radius_sigma == pytest.approx(8.7e-3, rel=0.1)

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hypotheses of which the cloud alone makes no candidate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeprog_detect.candidate_search import Search
+from pipeprog_detect.cloud import octree
+from pipeprog_detect.cloud.acceptance import seen_from_outside
+from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
+from pipeprog_detect.types import View
+from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
+from pipeprog_detect.verification.scene_context import SceneContext
+from tests.unit.detect.pipe_and_wall import PIPE
+
+NOISE = 1e-3
+# Stereo spreads both ends of 75 deg of the barrel outwards, and what is left agrees with a plane as with a pipe.
+HALF, OUTWARDS = np.radians(37.5), 4.5e-3
+
+
+def spread_search(views: list[View], planned: float) -> Search:
+    rng = np.random.default_rng(0)
+    angle, along = rng.uniform(-HALF, HALF, 3000), rng.uniform(0.0, PIPE.length, 3000)
+    side = np.cross(PIPE.axis, [0.0, -1.0, 0.0])
+    normal = np.cos(angle)[:, None] * np.cross(side, PIPE.axis) + np.sin(angle)[:, None] * side
+    seen = PIPE.radius + OUTWARDS * (angle / HALF) ** 4
+    points = PIPE.start + along[:, None] * PIPE.axis + seen[:, None] * normal + rng.normal(0.0, NOISE, (3000, 3))
+    boq = BillOfQuantities((PipeClass("planned", planned, 3.0, (0.0, 0.0, 1.0), 4e-4),))
+    tree, config = octree.build(points), DetectConfig()
+    around = SceneContext(tree, None, [], tree, NOISE)
+    criteria, verifier = seen_from_outside(NOISE, config), KeyframeVerifier(views, boq)
+    return Search(tree, around, criteria, (0.008, 0.2), [planned], config, verifier, lambda *_: None)
+
+
+def test_at_a_planned_radius_the_keyframes_make_a_pipe_of_it(pipe_views: list[View], empty_views: list[View]) -> None:
+    for views, planned, count in (
+        (pipe_views, PIPE.radius, 1),
+        (pipe_views, 1.2 * PIPE.radius, 0),  # not within half a step between sizes
+        (empty_views, PIPE.radius, 0),
+        ([], PIPE.radius, 0),
+    ):
+        search = spread_search(views, planned)
+        none = np.zeros(len(search.tree.points), bool)
+        candidates = search.candidates(none, [PIPE], [])
+        assert len(candidates) == count
+        for candidate in candidates:
+            assert candidate.radius_held
+            [measured] = search.verifier.measure([candidate], [False])
+            assert measured.cylinder.radius == pytest.approx(PIPE.radius, abs=2e-4)
+            assert np.linalg.norm(measured.cylinder.from_axis(PIPE.middle[None])) < NOISE
