@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -106,6 +108,14 @@ def _summed(steps: NDArray[np.float32], moves: NDArray[np.float32], response: ND
     return result
 
 
+@cache
+def _grid() -> FloatArray:
+    """`FIRST_ROUND` points (M, 5) of Sobol's sequence, all over the range from -1 to 1 in each dimension."""
+    from scipy.stats import qmc  # here, since its import takes half a second, in processes that never search, too
+
+    return np.asarray(qmc.Sobol(5, seed=0).random(FIRST_ROUND) * 2.0 - 1.0)
+
+
 def _annealed(
     samples: ContourSamples, response: NDArray[np.float32], offsets: FloatArray, reach: FloatArray, seeds: FloatArray
 ) -> FloatArray:
@@ -114,13 +124,10 @@ def _annealed(
     Points of Sobol's sequence all over the range, and the `seeds` (S, 5), are scored against widely smeared edges; the
     best spread again and again, less from round to round, over edges that are smeared less (annealing).
     """
-    from scipy.stats import qmc  # here, since its import takes half a second, in processes that never search, too
-
     random = np.random.default_rng(0)
     gain = float(np.median(samples.gain))
     half_width = float(np.median(samples.half_width))
-    grid = qmc.Sobol(5, seed=random).random(FIRST_ROUND) * 2.0 - 1.0
-    population = np.concatenate([np.zeros((1, 5)), seeds, grid * reach])
+    population = np.concatenate([np.zeros((1, 5)), seeds, _grid() * reach])
     lines = np.stack([samples.jacobian[samples.side == side].mean(axis=0) for side in np.unique(samples.side)], axis=1)
     width = max(FIRST_SMEAR * half_width, LEAST_SMEAR)
     spread = FIRST_SPREAD * reach
@@ -139,19 +146,34 @@ def _annealed(
         width = max(DECREASE * width, LEAST_SMEAR)
 
 
+@njit(cache=True, nogil=True)
 def _survivors(displacement: FloatArray) -> NDArray[np.int64]:
     """Indices of the first `ELITES` of displacements (M, sides) [px] with no more than `CROWD` in one cell.
 
     Keeps rivals alive, such as a contour and a shadow's edge beside it, until sub-pixel edges decide.
     """
-    place = np.round(displacement / CELL).astype(np.int64)
-    _, cells = np.unique(place, axis=0, return_inverse=True)
-    order = np.argsort(cells.ravel(), kind="stable")
-    ordered = cells.ravel()[order]
-    first = np.r_[0, np.flatnonzero(np.diff(ordered)) + 1]
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order)) - np.repeat(first, np.diff(np.r_[first, len(order)]))
-    return np.flatnonzero(rank < CROWD)[:ELITES]
+    count, sides = displacement.shape
+    cells = np.empty((ELITES, sides), np.int64)
+    crowd = np.zeros(ELITES, np.int64)
+    kept = np.empty(ELITES, np.int64)
+    known = alive = 0
+    place = np.empty(sides, np.int64)
+    for index in range(count):
+        for side in range(sides):
+            place[side] = round(displacement[index, side] / CELL)
+        cell = 0
+        while cell < known and (cells[cell] != place).any():
+            cell += 1
+        if cell == known:
+            cells[cell] = place
+            known += 1
+        if crowd[cell] < CROWD:
+            crowd[cell] += 1
+            kept[alive] = index
+            alive += 1
+            if alive == ELITES:
+                break
+    return kept[:alive]
 
 
 def distinct(steps: FloatArray, samples: ContourSamples, apart: float, limit: int) -> FloatArray:
