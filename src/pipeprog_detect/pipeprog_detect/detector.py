@@ -152,6 +152,7 @@ def detect_outside(
     # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
     criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
     measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
+    judging = _with_blur(judging, measured)
     points = (prepared.points if judging else prepared.points[:0]).astype(np.float32)  # for what is judged in the views
 
     def is_genuine(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
@@ -201,6 +202,12 @@ def _noise_on_pipes(prepared: PreparedCloud, verifier: KeyframeVerifier) -> floa
     """Standard deviation [m] of the points on pipes; a cloud with keyframes, or with normals, is one of stereo."""
     stereo = verifier.has_views or prepared.around.outward is not None
     return _STEREO_ON_PIPES * prepared.sigma if stereo else prepared.sigma
+
+
+def _with_blur(views: Sequence[View], measured: Sequence[MeasuredPipe]) -> list[View]:
+    """The views with the blur that the contours of thick pipes show: on a thin one it is not told from the width."""
+    blurs = [each.fit.blur for each in measured if each.fit is not None and each.cylinder.radius >= THICKEST_LINE]
+    return [replace(view, blur=float(np.median(blurs))) for view in views] if blurs else list(views)
 
 
 def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:

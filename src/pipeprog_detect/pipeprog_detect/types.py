@@ -29,7 +29,8 @@ class View:
 
     Pixels are those of the stamp, at which a camera with a rolling shutter exposes its middle row: `rolled` tells where
     the image shows them, None: there. `nearest` (h, w) float32, where it is known: depth [m] of what the cloud shows in
-    each of h x w equal cells.
+    each of h x w equal cells. `blur`, where it is known: that of the image by lens, pixel and motion together, as a
+    standard deviation [px].
     """
 
     stamp: int
@@ -38,6 +39,7 @@ class View:
     camera_from_map: FloatArray
     nearest: NDArray[np.float32] | None = None
     rolled: RolledImage | None = None
+    blur: float | None = None
 
     @cached_property
     def centre(self) -> FloatArray:

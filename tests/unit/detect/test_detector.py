@@ -16,6 +16,7 @@ from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
+from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -185,3 +186,16 @@ def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View],
     assert judged(measured, pipe_views) == measured[:1]
     assert judged(measured[:1], empty_views) == measured[:1]  # thick: the cloud shows it
     assert judged(measured, []) == measured
+
+
+def test_the_blur_of_the_views_is_that_of_thick_pipes(pipe_views: list[View]) -> None:
+    def pipe(radius: float, blur: float) -> MeasuredPipe:
+        cylinder = replace(PIPE, radius=radius)
+        evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
+        fit = ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 2e-4, 0.7, 100.0, 20, (0.0, 0.0), 0.0, 0.5, blur)
+        return MeasuredPipe.of_contour(Candidate(cylinder, 2e-4, 100, evidence), fit)
+
+    thick, thin = [pipe(0.04, blur) for blur in (0.6, 0.7, 1.4)], pipe(0.0086, 2.0)
+    of_cloud = replace(thick[0], fit=None)
+    assert {view.blur for view in detector._with_blur(pipe_views, [*thick, thin, of_cloud])} == {0.7}
+    assert detector._with_blur(pipe_views, [thin, of_cloud]) == pipe_views

@@ -35,6 +35,7 @@ class ContourFit:
         flatness: 0 for a cylinder, whose contour keeps its distance from the axis from all sides; 1 for a painted strip
             or a joint, whose edges stay where they are.
         flatness_sigma: its standard deviation.
+        blur: of the images there [px].
     """
 
     cylinder: Cylinder
@@ -47,6 +48,7 @@ class ContourFit:
     rims: tuple[float, float]
     flatness: float
     flatness_sigma: float
+    blur: float = float("nan")
 
     @property
     def is_flat(self) -> bool:
@@ -87,4 +89,5 @@ def contour_fit(found: AdjustedCylinder, ends: tuple[End | None, End | None]) ->
         len(np.unique(found.samples.view[found.used])),
         (start.odds if start else 0.0, end.odds if end else 0.0),
         *flatness(found),
+        found.scene.blur,
     )

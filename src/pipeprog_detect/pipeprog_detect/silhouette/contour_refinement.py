@@ -93,7 +93,8 @@ def refine(
     if first is None:
         return None
     steps, prior = first
-    scene = replace(scene, blur=scene.moved(steps[0]).measured_blur())
+    if any(view.blur is None for view in views):
+        scene = replace(scene, blur=scene.moved(steps[0]).measured_blur())
     held = prior.copy()
     held[4, 4] = 1.0 / (RADIUS_FIXED if start.radius_fixed else RADIUS_HELD) ** 2
     priors = [held] if start.radius_known else [prior]

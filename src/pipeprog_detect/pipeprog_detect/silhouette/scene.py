@@ -74,12 +74,14 @@ class Scene:
     others: Sequence[Cylinder]
     basis: FloatArray
     view_offset: FloatArray
-    blur: float = SHARP
+    blur: float
 
     @classmethod
     def of(cls, cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> Scene:
-        """The scene of a cylinder before its contour is measured: sharp views with true poses."""
-        return cls(cylinder, views, others, frame(cylinder, viewing_direction(cylinder, views)), np.zeros(len(views)))
+        """The scene of a cylinder before its contour is measured: views with true poses, sharp as far as is known."""
+        basis = frame(cylinder, viewing_direction(cylinder, views))
+        blur = float(np.median([SHARP if view.blur is None else view.blur for view in views]))
+        return cls(cylinder, views, others, basis, np.zeros(len(views)), blur)
 
     def turned_to(self, cylinder: Cylinder) -> Scene:
         """The scene of another cylinder, with its basis."""
@@ -157,10 +159,10 @@ class Scene:
         return Profiles(offsets, self.light(samples, offsets, SPACING // 2))
 
     def measured_blur(self) -> float:
-        """The blur [px] by which the limb model explains the contour best; a sharp image's where it is not seen."""
+        """The blur [px] by which the limb model explains the contour best; that of the views where it is not seen."""
         samples, offsets, values = replace(self, blur=1.0)._profiles(BLUR_REACH, SPACING, BLUR_SAMPLES)
         if not len(samples):
-            return SHARP
+            return self.blur
         trials = np.arange(-BLUR_REACH, BLUR_REACH + 0.1, 0.2, dtype=float)
         tried = [least_cost(values, offsets, samples.half_width, float(blur), trials) for blur in BLURS]
         cost = np.log(np.stack([limb for limb, _ in tried]) / tried[0][1] + 1e-4)
@@ -172,7 +174,7 @@ class Scene:
             if members.sum() >= LEAST_CLEAR:
                 best.append(_lowest(np.log(BLURS), cost[:, members].sum(axis=1)))
         if len(best) < LEAST_LINES:
-            return SHARP
+            return self.blur
         return float(np.exp(BLUR_STEP * np.round(np.quantile(best, SHARPEST) / BLUR_STEP)))
 
     def _profiles(

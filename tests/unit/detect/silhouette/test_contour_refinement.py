@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
@@ -82,6 +83,21 @@ def test_same_input_same_result(pipe_views: list[View]) -> None:
     assert second is not None
     assert first.cylinder.radius == second.cylinder.radius
     np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_the_blur_of_views_is_measured_unless_it_is_known(pipe_views: list[View]) -> None:
+    blurred = [dataclasses.replace(view, image=cv2.GaussianBlur(view.image, (0, 0), 1.2)) for view in pipe_views]
+    known = [dataclasses.replace(view, blur=1.35) for view in blurred]
+    sharp, measured, told = (refine(Start(PIPE, 0.002), views, []) for views in (pipe_views, blurred, known))
+    assert sharp is not None
+    assert measured is not None
+    assert told is not None
+    # Blurs are tried in steps of a fifth.
+    assert measured.blur == pytest.approx(np.hypot(sharp.blur, 1.2), rel=0.2)
+    assert told.blur == 1.35
+    # On a contour whose own blur is not measured, the views' one shows more edges than a sharp image's.
+    as_sharp, as_blurred = (Scene.of(PIPE, views, []).support().hits.sum() for views in (blurred, known))
+    assert as_blurred > 1.1 * as_sharp
 
 
 def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
