@@ -172,7 +172,8 @@ def detect_outside(
     measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
     whole = _judged(with_open_ends(joined(measured, judging), around, judging), judging, has_two_edges)
     ended = _abutted(with_grown_ends(whole, judging), around, judging)
-    return [each for each in ended if not is_hanger(each, prepared.points)]
+    standing = [each for each in ended if not is_hanger(each, prepared.points)]
+    return [each for each in standing if each.cylinder.length >= config.length_min]
 
 
 def _candidates(

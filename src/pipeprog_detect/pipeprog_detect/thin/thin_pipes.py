@@ -18,6 +18,7 @@ from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.axis_sweep import Proposal, propose_parallel
+from pipeprog_detect.thin.corners import is_corner
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_false_line
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
@@ -86,12 +87,17 @@ def find_thin_pipes(
         narrow = [each for each in known if each.radius < thickest]
         return centre is not None and any(covers(each, cylinder, centre, TOUCHING) for each in narrow)
 
+    def is_no_pipe(cylinder: Cylinder) -> bool:
+        """Whether it is a line on a wall, or looks like the one in which two walls meet."""
+        centre = mean_centre(cylinder, views)
+        return around.touches_wall(cylinder) or (centre is not None and is_corner(cylinder, centre, around))
+
     def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
             return
         if is_rival(fit.cylinder):
             return
-        if around.touches_wall(fit.cylinder):
+        if is_no_pipe(fit.cylinder):
             return
         if is_false_line(fit.cylinder, fit, some, around.planes, views, known):
             return
@@ -100,7 +106,7 @@ def find_thin_pipes(
 
     seen = pair_views(views, some, radii, known, edges)
     swept = propose_parallel([each.view for each in seen], parallel_directions(known), radii, known)
-    before_walls = [each for each in swept if not around.touches_wall(each.cylinder)]
+    before_walls = [each for each in swept if not is_no_pipe(each.cylinder)]
     for parallel in before_walls[:MOST_PROPOSED]:
         if not is_known(parallel.cylinder, known) and not is_rival(parallel.cylinder):
             consider(lines.along_known_pipes(parallel, known))

@@ -111,13 +111,18 @@ class SceneContext:
 
         Lines on a wall, such as shadows, joints and its corner with the next one, look like a thin pipe on it.
         """
-        nearest = cylinder.radius + self._clear(0.0)
+        nearest = cylinder.radius + self.clearance
         offset = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, nearest)]
         along = cylinder.along(offset)
         near = np.linalg.norm(cylinder.from_axis(offset), axis=1) < nearest
         near &= (along > 0.0) & (along < cylinder.length)
         steps = max(int(cylinder.length / _STEP), 4)
         return len(np.unique((along[near] / cylinder.length * steps).astype(np.int64))) > 0.5 * steps
+
+    @property
+    def clearance(self) -> float:
+        """By how much [m] a wall may seem to be nearer than it is: three standard deviations, and its waviness."""
+        return self._clear(0.0)
 
     def _clear(self, radius_sigma: float) -> float:
         """By how much [m] a wall may seem to be nearer than it is: three standard deviations, and its waviness."""
