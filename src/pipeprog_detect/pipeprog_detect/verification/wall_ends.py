@@ -81,8 +81,8 @@ def _distance(
     if abs(slope) < MEETS:
         return None
     distance = float(plane.offset - plane.normal @ end) / slope
-    # Half of the ends lie within ln 2 of the mean distance between them.
-    if not -0.5 * cylinder.length < distance < np.log(2.0) * cylinder.length:
+    # Half of the ends lie within ln 2 of the mean distance between them; of what lies behind the plane a radius is left.
+    if not cylinder.radius - cylinder.length < distance < np.log(2.0) * cylinder.length:
         return None
     place, thick = end + distance * out, ON_PLANE * plane.normal
     offset = walls.points[walls.near_segment(place - thick, place + thick, NEAR)] - place

@@ -81,8 +81,9 @@ def test_nothing_goes_on_to_a_plane_that_is_not_there_or_runs_along(pipe_views: 
     assert along.length == pytest.approx(PIPE.length, abs=1e-9)
 
 
-def test_what_lies_under_the_floor_is_cut_off(pipe_views: list[View]) -> None:
-    deeper = Cylinder(PIPE.start - 0.08 * PIPE.axis, PIPE.end, PIPE.radius)
+@pytest.mark.parametrize("below", [0.08, 0.9])
+def test_what_lies_under_the_floor_is_cut_off(pipe_views: list[View], below: float) -> None:
+    deeper = Cylinder(PIPE.start - below * PIPE.axis, PIPE.end, PIPE.radius)
     whole = with_ends_on_walls(deeper, (10.0, 10.0), floor(-0.2), pipe_views, [])
     assert height_of_start(whole) == pytest.approx(-0.2, abs=TOLERANCE)
 
