@@ -81,7 +81,7 @@ def _distance(
     if abs(slope) < MEETS:
         return None
     distance = float(plane.offset - plane.normal @ end) / slope
-    # Half of the ends lie within ln 2 of the mean distance between them; of what lies behind the plane a radius is left.
+    # Half of the ends lie within ln 2 of the mean distance between them; of what a plane hides a radius is left.
     if not cylinder.radius - cylinder.length < distance < np.log(2.0) * cylinder.length:
         return None
     place, thick = end + distance * out, ON_PLANE * plane.normal
