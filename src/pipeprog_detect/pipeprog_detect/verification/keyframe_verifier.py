@@ -59,7 +59,10 @@ class KeyframeVerifier:
         if any(_resembles(cylinder, refused) for refused in self._refused):
             return False
         if candidate.radius_held:
-            return self._fitter.of_visible_side(candidate, [], self._views) is not None
+            stands = self._fitter.of_visible_side(candidate, [], self._views) is not None
+            if not stands:
+                self._refused.append(cylinder)
+            return stands
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
         fit = self._fitter.fit(candidate, [], views, follow=False)
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
