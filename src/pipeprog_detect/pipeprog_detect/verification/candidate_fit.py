@@ -84,7 +84,7 @@ class CandidateFitter:
         side that is seen of a pipe does not tell its radius either. The radii are tried in the order in which the fit
         and the cloud together allow them.
         """
-        if fit is None or (self.is_planned(fit) and fit.radius_sigma < TOLD * fit.cylinder.radius):
+        if fit is None or (self._as_made(fit) and fit.radius_sigma < TOLD * fit.cylinder.radius):
             return fit
         radius = fit.cylinder.radius
         told = np.array([radius, candidate.cylinder.radius])
@@ -155,6 +155,11 @@ class CandidateFitter:
         """Whether the fit has a radius out of reach of the candidate's: it follows the edges of other things."""
         sigma = float(np.hypot(_sigma(candidate), fit.radius_sigma))
         return abs(fit.cylinder.radius - candidate.cylinder.radius) > REACH * sigma
+
+    def _as_made(self, fit: ContourFit) -> bool:
+        """Whether the fit has a planned radius, within its standard deviation and the tolerance of manufacture."""
+        radius, reach = fit.cylinder.radius, REACH * fit.radius_sigma
+        return any(abs(radius - planned) < reach + MANUFACTURE * planned for planned in self._radii())
 
     def _within_reach(self, candidate: Candidate) -> list[float]:
         """The planned radii [m] that the cloud of a candidate allows."""

@@ -137,6 +137,8 @@ class KeyframeVerifier:
                 fit = self._fitter.of_planned_radius(candidate, others, self._views)
             elif self._fitter.strays(candidate, fit):
                 fit = self._fitter.of_planned_radius(candidate, others, self._views) or fit
+            else:
+                fit = self._fitter.near_planned(candidate, fit, others, self._views)
             if fit is None or (candidate.blurred and is_stub(fit.cylinder)):
                 return None
             if (candidate.blurred or candidate.radius_held) and not self._shows_both_sides(fit.cylinder, others):

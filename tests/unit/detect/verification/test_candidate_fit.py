@@ -84,11 +84,11 @@ def test_the_side_that_is_seen_tells_two_planned_radii_apart(
     assert CandidateFitter(_boq(0.1035), MeasurementCache()).of_visible_side(candidate, [], []) is None
 
 
-@pytest.mark.parametrize(("thicker", "sigma"), [(0.003, 2e-4), (0.0005, 4e-3)])
+@pytest.mark.parametrize(("thicker", "sigma"), [(0.003, 2e-4), (0.0012, 1.5e-4), (0.0005, 4e-3)])
 def test_of_one_side_the_planned_radius_near_it_is_measured(
     pipe_views: list[View], thicker: float, sigma: float
 ) -> None:
-    """A wrong radius that is told well, and one that is not told: the other pipe hides what would tell it."""
+    """Wrong radii that are told well, one of a class but beyond 1 %, and one not told: what would tell it is hidden."""
     true = pipe_and_wall.PIPE
     evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
     rough = Candidate(replace(true, radius=true.radius + 0.006), 0.0015, 3000, evidence)
