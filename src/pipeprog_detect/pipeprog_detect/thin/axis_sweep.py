@@ -284,6 +284,38 @@ def _weigh(
 
 
 @njit(cache=True, nogil=True)
+def _distances(
+    line: FloatArray, place: FloatArray, size: IntArray, reach: NDArray[np.float32], radius: float
+) -> FloatArray:
+    """The distances (D,) [m] from the camera, farthest first, that the width of a line (6,) and what hides it allow.
+
+    `place` (8,), `size` (2,) and `reach` (R / BLOCK, C) are those of the line's view.
+    """
+    first, last, width = int(line[2]), int(line[3]), int(line[4])
+    inside = min(max(first, 0), size[1] - 1)
+    seen = reach[_block_of(line[1] + 0.5 * (width % 2), size[0]), inside : max(last, inside) + 1]
+    near = (0.5 * width + WIDER) * place[4] / radius  # inverse distances
+    far = max(max(0.5 * width - WIDER, 0.5) * place[4] / radius, 1.0 / (seen.max() + BEFORE))
+    if far >= near:
+        return np.empty(0)
+    return 1.0 / np.linspace(far, near, int((near - far) / (STEP_ROWS * place[4] / BASELINE)) + 2)
+
+
+@njit(cache=True, nogil=True)
+def _best_run(gains: FloatArray) -> tuple[float, int, int]:
+    """The largest sum of consecutive gains (B,), where its run begins, and where it ends; 0 without a positive one."""
+    best, low, high = 0.0, 0, 0
+    running, begin = 0.0, 0
+    for b in range(len(gains)):
+        if running <= 0.0:
+            running, begin = 0.0, b
+        running += gains[b]
+        if running > best:
+            best, low, high = running, begin, b + 1
+    return best, low, high
+
+
+@njit(cache=True, nogil=True)
 def _at_best_depth(
     lines: FloatArray,
     place: FloatArray,
@@ -298,56 +330,35 @@ def _at_best_depth(
     For the other arguments see `_weigh`.
     """
     result = np.zeros((len(lines), _COLUMNS))
+    longest = int(2.0 * LONGEST / STRETCH)
     for k in range(len(lines)):
         v, first, last = int(lines[k, 0]), int(lines[k, 2]), int(lines[k, 3])
-        width = int(lines[k, 4])
-        row = lines[k, 1] + 0.5 * (width % 2)
-        angle = place[v, 3] + (row - place[v, 7]) * place[v, 4]
-        near = (0.5 * width + WIDER) * place[v, 4] / radius  # inverse distances
-        far = max(0.5 * width - WIDER, 0.5) * place[v, 4] / radius
-        inside = min(max(first, 0), size[v, 1] - 1)
-        seen = reach[v, _block_of(row, size[v, 0]), inside : max(last, inside) + 1]
-        far = max(far, 1.0 / (seen.max() + BEFORE))
-        if far >= near:
-            continue
+        distances = _distances(lines[k], place[v], size[v], reach[v], radius)
+        angle = place[v, 3] + (lines[k, 1] + 0.5 * (int(lines[k, 4]) % 2) - place[v, 7]) * place[v, 4]
+        across, up = np.cos(angle), np.sin(angle)
         least, most = (first + place[v, 5]) * place[v, 6], (last + 1.0 + place[v, 5]) * place[v, 6]
-        tries = int((near - far) / (STEP_ROWS * place[v, 4] / BASELINE)) + 2
-        scores = np.empty(tries)
-        best, longest, count = -1, int(2.0 * LONGEST / STRETCH), max((last + 1 - first) // COLUMNS, 3)
+        count = max((last + 1 - first) // COLUMNS, 3)
         total = np.empty(max(longest, count))
-        for s in range(tries):
-            away = 1.0 / (far + (near - far) * s / (tries - 1))
-            low, length = place[v, 2] + least * away, (most - least) * away
-            at = (place[v, 0] + away * np.cos(angle), place[v, 1] + away * np.sin(angle), low, length / count)
+        scores = np.empty(len(distances))
+        for d, away in enumerate(distances):
+            low, step = place[v, 2] + least * away, (most - least) * away / count
+            at = (place[v, 0] + away * across, place[v, 1] + away * up, low, step)
             _weigh(at, total[:count], place, size, edges, reach, odds, radius)
-            scores[s] = total[:count].sum()
-            if scores[s] > 0.0 and (best < 0 or scores[s] > scores[best]):
-                best = s
-        if best < 0:
+            scores[d] = total[:count].sum()
+        if not (scores > 0.0).any():
             continue
-        away = 1.0 / (far + (near - far) * best / (tries - 1))
-        nearest, farthest = away, away
-        for s in range(tries):
-            if scores[s] > scores[best] - DECISIVE:
-                other = 1.0 / (far + (near - far) * s / (tries - 1))
-                nearest, farthest = min(nearest, other), max(farthest, other)
-        x, y = place[v, 0] + away * np.cos(angle), place[v, 1] + away * np.sin(angle)
+        away = distances[scores.argmax()]
+        likely = distances[scores > scores.max() - DECISIVE]
+        # Half of the range is two standard deviations; the next step might be as good.
+        sigma = 0.25 * (likely.max() - likely.min()) + 0.5 * STEP_ROWS * place[v, 4] / BASELINE * away**2
+        x, y = place[v, 0] + away * across, place[v, 1] + away * up
         low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
         at = (x, y, low, STRETCH)
         agreeing, centre_x, centre_y, along = _weigh(at, total[:longest], place, size, edges, reach, odds, radius)
-        result[k, _VIEWS], result[k, _CENTRE_X], result[k, _CENTRE_Y] = agreeing, centre_x, centre_y
-        result[k, _CENTRE_ALONG] = along
-        running, begin = 0.0, 0
-        for b in range(longest):
-            if running <= 0.0:
-                running, begin = 0.0, b
-            running += total[b]
-            if running > result[k, _ODDS]:
-                result[k, _ODDS] = running
-                result[k, _LOW], result[k, _HIGH] = low + begin * STRETCH, low + (b + 1) * STRETCH
-        result[k, _ODDS] *= STRETCH / (COLUMNS * place[v, 6] * away)
-        # Half of the range is two standard deviations; the next step might be as good.
-        step = STEP_ROWS * place[v, 4] / BASELINE * away**2
-        result[k, _X], result[k, _Y], result[k, _SIGMA] = x, y, 0.25 * (farthest - nearest) + 0.5 * step
+        best, begin, end = _best_run(total[:longest])
+        result[k, _ODDS] = best * STRETCH / (COLUMNS * place[v, 6] * away)
+        result[k, _X], result[k, _Y], result[k, _SIGMA], result[k, _VIEWS] = x, y, sigma, agreeing
+        result[k, _LOW], result[k, _HIGH] = low + begin * STRETCH, low + end * STRETCH
+        result[k, _CENTRE_X], result[k, _CENTRE_Y], result[k, _CENTRE_ALONG] = centre_x, centre_y, along
         result[k, _LINE] = k
     return result

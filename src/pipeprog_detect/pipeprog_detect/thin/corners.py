@@ -13,12 +13,8 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.thin.depth_from_cloud import covers
 from pipeprog_detect.types import Cylinder
-from pipeprog_detect.verification.scene_context import SceneContext
+from pipeprog_detect.verification.scene_context import ALONG, CORNER, SceneContext
 
-# Planes that meet at less than 30 deg make no corner that is an edge in an image.
-_CORNER = float(np.cos(np.radians(30.0)))
-# A line is as good as parallel to a corner within this angle: they must look alike all along anyway.
-_PARALLEL = float(np.cos(np.radians(6.0)))
 # The line of sight passes a corner that a line may be by no more than this, in radii: the corner is one of its sides.
 _ASIDE = 2.0
 # Both planes must be there within this distance of the corner [m], along more than half of it, looked at in such steps.
@@ -35,9 +31,9 @@ def is_corner(cylinder: Cylinder, centre: FloatArray, around: SceneContext) -> b
 
 def _parallel_corners(cylinder: Cylinder, around: SceneContext) -> Iterator[tuple[Plane, Plane, Cylinder]]:
     """The pairs of planes that meet along the cylinder's direction, and its place on the line in which they meet."""
-    along = [plane for plane in around.planes if abs(plane.normal @ cylinder.axis) < np.sqrt(1.0 - _PARALLEL**2)]
+    along = [plane for plane in around.planes if abs(plane.normal @ cylinder.axis) < ALONG]
     for one, other in combinations(along, 2):
-        if abs(one.normal @ other.normal) < _CORNER:
+        if abs(one.normal @ other.normal) < CORNER:
             direction = np.cross(one.normal, other.normal)
             direction /= np.linalg.norm(direction)
             normals = np.stack([one.normal, other.normal, direction])

@@ -84,7 +84,9 @@ class CandidateFitter:
         side that is seen of a pipe does not tell its radius either. The radii are tried in the order in which the fit
         and the cloud together allow them.
         """
-        if fit is None or (self._as_made(fit) and fit.radius_sigma < TOLD * fit.cylinder.radius):
+        if fit is None or (
+            any(_has_size(fit, planned) for planned in self._radii()) and fit.radius_sigma < TOLD * fit.cylinder.radius
+        ):
             return fit
         radius = fit.cylinder.radius
         told = np.array([radius, candidate.cylinder.radius])
@@ -117,10 +119,7 @@ class CandidateFitter:
         good = [
             fit
             for planned, fit in fits
-            if fit is not None
-            and fit.support > CONVINCING
-            and self.is_planned(fit)
-            and abs(fit.cylinder.radius - planned) < REACH * fit.radius_sigma + MANUFACTURE * planned
+            if fit is not None and fit.support > CONVINCING and self.is_planned(fit) and _has_size(fit, planned)
         ]
         return max(good, key=lambda fit: fit.log_odds, default=None)
 
@@ -155,11 +154,6 @@ class CandidateFitter:
         """Whether the fit has a radius out of reach of the candidate's: it follows the edges of other things."""
         sigma = float(np.hypot(_sigma(candidate), fit.radius_sigma))
         return abs(fit.cylinder.radius - candidate.cylinder.radius) > REACH * sigma
-
-    def _as_made(self, fit: ContourFit) -> bool:
-        """Whether the fit has a planned radius, within its standard deviation and the tolerance of manufacture."""
-        radius, reach = fit.cylinder.radius, REACH * fit.radius_sigma
-        return any(abs(radius - planned) < reach + MANUFACTURE * planned for planned in self._radii())
 
     def _within_reach(self, candidate: Candidate) -> list[float]:
         """The planned radii [m] that the cloud of a candidate allows."""
@@ -221,3 +215,8 @@ def _seen_arc(candidate: Candidate) -> SeenArc:
 def _sigma(candidate: Candidate) -> float:
     """Standard deviation of the surface [m]: it may lie as far from its points' mean as these scatter."""
     return max(candidate.radius_sigma, candidate.evidence.noise)
+
+
+def _has_size(fit: ContourFit, planned: float) -> bool:
+    """Whether a fit has the planned radius [m], within its standard deviation and the tolerance of manufacture."""
+    return abs(fit.cylinder.radius - planned) < REACH * fit.radius_sigma + MANUFACTURE * planned

@@ -17,11 +17,12 @@ from pipeprog_detect.types import Cylinder
 
 # Mean cosine between the normals of a pipe and those of its points: noise turns a thin pipe's by less than 60 deg.
 _OUTWARD = 0.5
-# A plane is tangent to a cylinder along it within these angles, and at its radius but for this share and the noise.
-_ALONG = float(np.sin(np.radians(6.0)))
+# A plane goes along a cylinder within this angle (sine), and is tangent to it at its radius but for this share and the
+# noise.
+ALONG = float(np.sin(np.radians(6.0)))
 _TANGENT = 0.15
-# Planes that meet at less than 30 deg make no corner.
-_CORNER = float(np.cos(np.radians(30.0)))
+# Planes that meet at less than 30 deg (cosine) make no corner.
+CORNER = float(np.cos(np.radians(30.0)))
 # Walls are looked at in steps [m] of a cylinder's length, up to this far beside its surface: in radii, at least in
 # metres.
 _STEP, _BESIDE, _LEAST_BESIDE = 0.05, 3.0, 0.03
@@ -76,9 +77,9 @@ class SceneContext:
         feet = []
         for plane in self.planes:
             away = plane.offset - float(plane.normal @ cylinder.middle)
-            if abs(plane.normal @ cylinder.axis) < _ALONG and abs(abs(away) - cylinder.radius) < allowed:
+            if abs(plane.normal @ cylinder.axis) < ALONG and abs(abs(away) - cylinder.radius) < allowed:
                 feet.append(np.sign(away) * plane.normal)
-        corners = [one + other for k, one in enumerate(feet) for other in feet[:k] if abs(float(one @ other)) < _CORNER]
+        corners = [one + other for k, one in enumerate(feet) for other in feet[:k] if abs(float(one @ other)) < CORNER]
         if not corners:
             return False
         front = self._surface(candidate)[1].mean(axis=0)
