@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -28,11 +29,15 @@ class InvalidMessageError(InputError):
 
 
 class Intake:
-    """Subscriptions of a node whose messages are converted first; what cannot be is dropped, counted and said once."""
+    """Subscriptions of a node whose messages are converted first; what cannot be is dropped, counted and said once.
+
+    What the network lost on the way is counted as well, where the middleware notices it: best-effort data on Wi-Fi.
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._rejected: Counter[tuple[str, str]] = Counter()
+        self._lost: Counter[str] = Counter()
 
     def subscribe(
         self,
@@ -59,7 +64,17 @@ class Intake:
                 return
             use(value)
 
-        return self._node.create_subscription(message_type, topic, receive, profile, qos_overriding_options=overriding)
+        def lose(lost: QoSMessageLostInfo) -> None:
+            self._lost[topic] += lost.total_count_change
+
+        return self._node.create_subscription(
+            message_type,
+            topic,
+            receive,
+            profile,
+            event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
+            qos_overriding_options=overriding,
+        )
 
     def reject(self, source: str, error: InputError) -> None:
         """Counts what was dropped from a topic or service, and says the first of each kind in words."""
@@ -76,6 +91,12 @@ class Intake:
         """Messages dropped so far."""
         return self._rejected.total()
 
+    @property
+    def lost(self) -> int:
+        """Messages so far that the network lost on the way."""
+        return self._lost.total()
+
     def health(self) -> dict[str, Any]:
-        """Numbers of dropped messages by topic and kind, for the diagnostics."""
-        return {f"dropped on {source}: {kind}": count for (source, kind), count in sorted(self._rejected.items())}
+        """Numbers of dropped messages by topic and kind, and of lost ones by topic, for the diagnostics."""
+        dropped = {f"dropped on {source}: {kind}": count for (source, kind), count in sorted(self._rejected.items())}
+        return {**dropped, **{f"lost on the way to {topic}": count for topic, count in sorted(self._lost.items())}}

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
 
 from pipeprog_camera.errors import InputError
@@ -18,10 +20,20 @@ class FakeNode:
 
     def __init__(self) -> None:
         self.callbacks: dict[str, Callable[[Any], None]] = {}
+        self.losses: dict[str, Callable[[Any], None]] = {}
         self.logged: list[str] = []
 
-    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], *_: Any, **__: Any) -> None:
+    def create_subscription(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        *_: Any,
+        event_callbacks: SubscriptionEventCallbacks,
+        **__: Any,
+    ) -> None:
         self.callbacks[topic] = callback
+        self.losses[topic] = event_callbacks.message_lost
 
     def get_logger(self) -> FakeNode:
         return self
@@ -75,3 +87,13 @@ def test_each_kind_is_said_once(node: FakeNode) -> None:
         "dropped a message on /site/numbers: -2 is negative",
         "dropped a message on /site/numbers: zero",
     ]
+
+
+def test_what_the_network_loses_is_counted_by_topic(node: FakeNode) -> None:
+    intake = Intake(node)
+    for topic in ("numbers", "others"):
+        intake.subscribe(int, topic, positive, lambda _: None, QoSProfile(depth=1))
+    for total, change in ((2, 2), (5, 3)):
+        node.losses["numbers"](SimpleNamespace(total_count=total, total_count_change=change))
+    assert intake.lost == 5
+    assert intake.health() == {"lost on the way to numbers": 5}
