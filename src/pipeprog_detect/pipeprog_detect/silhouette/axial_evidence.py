@@ -59,6 +59,11 @@ class AxialEvidence:
         outside = self.along > 0.0
         return np.append(0.0, self.along[outside]), np.append(0.0, np.cumsum(self.log_odds[outside]))
 
+    def unseen_before_end(self) -> float:
+        """Length [m] of the stretch before the end in which nothing is seen: the end was placed by other evidence."""
+        seen = self.along[(self.along < 0.0) & (self.seen > 0.0)]
+        return -float(seen.max(initial=self.along[0]))
+
 
 def axial_evidence(scene: Scene, at_end: bool, ahead: float) -> AxialEvidence | None:
     """The evidence of the contour up to `ahead` [m] beyond an end; None where the pipe does not stand out.

@@ -67,7 +67,7 @@ def end_posterior(cylinder: Cylinder, at_end: bool, views: Sequence[View], other
 
     Prior: ends occur as a Poisson process with one end per measured length. The contour tells how far the pipe goes,
     to some samples; an edge all around the barrel tells it to half a pixel. Where something hides the pipe the prior is
-    all there is: the end may lie anywhere in the hidden stretch.
+    all there is: the end may lie anywhere in the hidden stretch, before the given end as well as beyond it.
 
     Args:
         cylinder: the measured pipe.
@@ -80,11 +80,17 @@ def end_posterior(cylinder: Cylinder, at_end: bool, views: Sequence[View], other
     inside, ahead = min(near, MOST_INSIDE * cylinder.length), min(max(cylinder.length, near), FARTHEST)
     beyond = barrel.end + np.linspace(0.0, ahead, LOOKED_AT)[:, None] * barrel.axis
     in_view = any(in_image(view, barrel.end[None] + LEAST * barrel.axis).any() for view in views)
-    looking = views_showing(beyond, views, ENOUGH_VIEWS) or list(views[:1])
+    looking = (
+        views_showing(beyond, views, ENOUGH_VIEWS)
+        or views_showing(barrel.at(np.linspace(0.5, 1.0, LOOKED_AT)), views, ENOUGH_VIEWS)
+        or list(views[:1])
+    )
     pixel = pixel_at(barrel.end, looking)
+    evidence = axial_evidence(Scene.of(cylinder, looking, others), at_end, ahead)
+    if evidence is not None:
+        inside = max(inside, evidence.unseen_before_end())
     position = np.arange(-inside, ahead, pixel / SAMPLES_PER_PIXEL, dtype=float)
     odds = -np.maximum(position, 0.0) / cylinder.length
-    evidence = axial_evidence(Scene.of(cylinder, looking, others), at_end, ahead)
     if evidence is not None:
         odds += before_bend(contour_odds(evidence, position), position, evidence, cylinder.radius, pixel)
     showing = views_showing(barrel.end[None], views, ENOUGH_VIEWS)

@@ -70,3 +70,16 @@ def test_what_is_hidden_or_out_of_view_may_go_on(pipe_views: list[View]) -> None
     nowhere = end_posterior(far, True, pipe_views, [])
     assert not nowhere.in_view
     assert nowhere.sigma() > 0.3
+
+
+def test_an_end_on_a_wall_may_lie_anywhere_in_the_hidden_stretch_before_it(pipe_views: list[View]) -> None:
+    """The pipe was continued by 0.3 m to a wall behind a pipe across; of that 0.21 m are hidden."""
+    continued = Cylinder(PIPE.start, PIPE.end + 0.3 * PIPE.axis, PIPE.radius)
+    middle = PIPE.end + 0.15 * PIPE.axis + np.array([0.0, -0.25, 0.02])
+    across = Cylinder(middle - np.array([0.6, 0.0, 0.0]), middle + np.array([0.6, 0.0, 0.0]), 0.13)
+    posterior = end_posterior(continued, True, pipe_views, [across])
+    assert posterior.position[0] == pytest.approx(-0.21, abs=STEP)
+    place = np.minimum(posterior.position, 0.0)
+    hidden = posterior.probability[(posterior.position > -0.21 + STEP) & (place < 0.0)]
+    assert hidden.min() == pytest.approx(hidden.max(), rel=0.1)
+    assert posterior.sigma(0.0) == pytest.approx(np.sqrt(posterior.probability @ place**2), rel=0.05)
