@@ -32,6 +32,7 @@ Settings are read-only parameters; a request that cannot be met is answered with
 
 A message that fails is dropped.
 It is counted by topic and kind in `/diagnostics` (`dropped on TOPIC: KIND`, level WARN), and the first of each kind is said in the node's log, in words.
+What the network loses before it arrives is counted by topic, too (`lost on the way to TOPIC`), where the middleware notices it.
 Reconstruction and detection run in child processes: one that ends is started again, and what it was working on is not given to it again.
 A latched message that ends a worker is remembered by its digest, so that the middleware's copy of it does no harm either.
 
