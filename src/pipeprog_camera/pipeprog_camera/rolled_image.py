@@ -17,9 +17,10 @@ from pipeprog_camera.rolling_shutter import RowMotion
 _DEGREE = 7
 # Positions across the image, each way, at which the polynomial is fitted.
 _FITTED = 24
-# Each step multiplies the error by the pixels that the image moves while one row is read, at most 0.1 (70 px in 720
-# rows): 70 px become 0.001 px.
-_STEPS = 4
+# Each step multiplies the error by the pixels that the image moves while one row is read: 0.1 where it moves 70 px in
+# 720 rows, 0.3 at worst (1.5 m/s and 1.5 rad/s about all axes, 0.8 m away). A pixel is found to this [px], in so many
+# steps at the most.
+_SETTLED, _MOST_STEPS = 1e-6, 16
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,8 @@ def shown_at(u: float, v: float, depth: float, numbers: FloatArray, rows: FloatA
     fx, fy, cx, cy, per_row, first = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
     x, y = (u - cx) / fx * depth, (v - cy) / fy * depth
     column, line = u, v
-    for _ in range(_STEPS):
+    for _ in range(_MOST_STEPS):
+        left, above = column, line
         time = first + per_row * row_of(column, line, numbers, rows)
         a, b, c = time * numbers[9], time * numbers[10], time * numbers[11]
         # Rodrigues' formula; the series of sine and cosine are exact to 1e-7 up to 0.2 rad within one read-out.
@@ -119,6 +121,8 @@ def shown_at(u: float, v: float, depth: float, numbers: FloatArray, rows: FloatA
         far = depth + sine * r + cosine * (a * q - b * p) + time * numbers[8]
         column = fx * (x + sine * p + cosine * (b * r - c * q) + time * numbers[6]) / far + cx
         line = fy * (y + sine * q + cosine * (c * p - a * r) + time * numbers[7]) / far + cy
+        if abs(column - left) + abs(line - above) < _SETTLED:
+            break
     return column, line
 
 

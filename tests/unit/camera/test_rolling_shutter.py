@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeprog_camera.camera import Camera
@@ -37,6 +37,7 @@ def seen(seed: int, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "distorted"])
 @settings(max_examples=30, deadline=None)
 @given(linear=velocity, angular=velocity, readout=st.floats(0.0, 0.035), seed=st.integers(0, 100))
+@example(linear=np.array([0.0, -1.5, 1.0]), angular=np.array([1.0, 0.0, 0.0]), readout=0.03125, seed=0)
 def test_unrolled_undoes_rolled(
     camera: Camera, linear: np.ndarray, angular: np.ndarray, readout: float, seed: int
 ) -> None:
