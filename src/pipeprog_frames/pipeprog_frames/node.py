@@ -377,8 +377,8 @@ class FramesNode(Node):
             return DiagnosticStatus.WARN, f"the SfM cannot keep up: {fewer}", values
         if self._dropped:
             return DiagnosticStatus.WARN, "frames were dropped: the machine cannot keep up", values
-        if lost := self._input.intake.lost:
-            return DiagnosticStatus.WARN, f"{lost} messages of the camera were lost on the way to this node", values
+        if self._input.intake.lost:
+            return DiagnosticStatus.WARN, "messages were lost on the way to this node: the counts say which", values
         if self._faults or self._input.intake.rejected:
             return DiagnosticStatus.WARN, "messages or frames were refused: the counts say which", values
         return DiagnosticStatus.OK, "selecting", values
