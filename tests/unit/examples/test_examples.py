@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import runpy
 import subprocess
 import sys
@@ -39,6 +40,11 @@ def example(name: str, *arguments: str | Path) -> list[str]:
     result = run(name, *arguments)
     assert result.returncode == 0, result.stderr
     return result.stdout.splitlines()
+
+
+def asked(robot: FakeRobot) -> list[str]:
+    """What a robot was asked for; a goal whose answer is lost is sent again, and counts once."""
+    return [said for said, _ in itertools.groupby(robot.said)]
 
 
 def test_detect_on_a_cloud() -> None:
@@ -84,7 +90,7 @@ def test_read_results_into_pandas(tmp_path: Path) -> None:
 def test_nav2_waypoints(robot: FakeRobot) -> None:
     waypoints = ("--at", "1", "2", "90", "--at", "6", "2", "90", "--at", "9", "2", "0")
     assert example("nav2_waypoints.py", *waypoints, "--survey-id", "monday") == ["results: /surveys/monday"]
-    assert robot.said == ["follow 1", "survey monday", "follow 6 9", "end"]
+    assert asked(robot) == ["follow 1", "survey monday", "follow 6 9", "end"]
 
     robot.said.clear()
     robot.blocked = {"9"}
@@ -98,14 +104,14 @@ def test_nav2_waypoints(robot: FakeRobot) -> None:
 def test_spot_navigate_to(robot: FakeRobot) -> None:
     walk = ("begin", "middle", "end_of_wall", "--home", "dock", "--survey-id", "monday")
     assert example("spot_navigate_to.py", *walk) == ["results: /surveys/monday"]
-    assert robot.said == ["walk begin", "survey monday", "walk middle", "walk end_of_wall", "end", "walk dock"]
+    assert asked(robot) == ["walk begin", "survey monday", "walk middle", "walk end_of_wall", "end", "walk dock"]
 
     robot.said.clear()
     robot.blocked = {"middle"}
     stuck = run("spot_navigate_to.py", *walk)
     assert stuck.returncode == 1
     assert "not come to middle: no way" in stuck.stderr
-    assert robot.said == ["walk begin", "survey monday", "walk middle", "end", "walk dock"]
+    assert asked(robot) == ["walk begin", "survey monday", "walk middle", "end", "walk dock"]
 
 
 def test_spot_remote_mission(robot: FakeRobot, monkeypatch: pytest.MonkeyPatch) -> None:

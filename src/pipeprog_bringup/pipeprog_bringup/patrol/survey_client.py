@@ -29,6 +29,7 @@ GONE_SECONDS = 30.0  # from then on, until the survey is given up: a supervisor 
 # s from finding a server to the first goal: it must have found this client, too, or its answer is lost (rclpy#1123).
 # On two busy cores that once took more than one second.
 MATCHING_SECONDS = 2.0
+MOST_TIMES_ASKED = 3  # of a goal that moves the robot: one lost answer is rare, three mean that the driver is gone
 PAUSE = 1.0  # s between two goals, while none is accepted
 _SPIN = 0.05  # s between two looks at what is waited for
 
@@ -127,14 +128,12 @@ class SurveyClient:
 
         Raises InputError, with the action cancelled, where it is not accepted, or not over after `seconds`.
         """
-        if not self._is_ready(action):
-            raise InputError("the action that moves the robot is not there: is its driver running?")
-        sent = action.send_goal_async(goal)
-        if not self.wait(sent.done, ANSWER_SECONDS) or not sent.result().accepted:
-            raise InputError("the action that moves the robot has not accepted the goal")
-        over = sent.result().get_result_async()
+        handle = self._answer(action, goal)
+        if not handle.accepted:
+            raise InputError("the action that moves the robot has refused the goal")
+        over = handle.get_result_async()
         if not self.wait(over.done, seconds):
-            self.wait(sent.result().cancel_goal_async().done, ANSWER_SECONDS)
+            self.wait(handle.cancel_goal_async().done, ANSWER_SECONDS)
             raise InputError(f"the robot has not arrived after {seconds:g} s")
         return over.result().result
 
@@ -167,6 +166,17 @@ class SurveyClient:
             self.wait(lambda: False, MATCHING_SECONDS)
             self._matched.add(action)
         return True
+
+    def _answer(self, action: ActionClient, goal: Any) -> ClientGoalHandle:
+        """What a server says to a goal; it is asked again where the answer is lost: the place to go to is the same."""
+        for _ in range(MOST_TIMES_ASKED):
+            if not self._is_ready(action):
+                raise InputError("the action that moves the robot is not there: is its driver running?")
+            sent = action.send_goal_async(goal)
+            if self.wait(sent.done, ANSWER_SECONDS):
+                return sent.result()
+            self._matched.discard(action)
+        raise InputError(f"the action that moves the robot has not answered, asked {MOST_TIMES_ASKED} times")
 
     def _accepted(self, goal: Survey.Goal) -> bool:
         if not self._is_ready(self._action):

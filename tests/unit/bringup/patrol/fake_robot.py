@@ -42,6 +42,7 @@ class FakeRobot(Node):
         self.blocked: set[str] = set()
         self.is_killed = self._is_lost = self._is_filming = self._end_asked = False
         self.ends_itself = True
+        self._filmed = ""
         group = ReentrantCallbackGroup()
         options: dict[str, Any] = {"callback_group": group}
         self._actions = [
@@ -62,11 +63,12 @@ class FakeRobot(Node):
 
     def _on_goal(self, goal: Survey.Goal) -> GoalResponse:
         """Notes an accepted goal here: its client may go on before another thread executes it."""
-        if self._is_filming:
-            return GoalResponse.REJECT
+        if self._is_filming:  # as the node survey: a goal of the same name joins the survey that runs
+            return GoalResponse.ACCEPT if goal.survey_id and goal.survey_id == self._filmed else GoalResponse.REJECT
         self._is_lost = self.is_killed and not self.said
         self._is_filming, self._end_asked = True, self.is_killed and self.ends_itself and not self._is_lost
         self.said.append(f"survey {goal.survey_id}")
+        self._filmed = goal.survey_id
         return GoalResponse.ACCEPT
 
     def _survey(self, handle: Any) -> Survey.Result:

@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import pytest
 import rclpy
+from rclpy.action import ActionClient
+from rclpy.task import Future
+from spot_msgs.action import NavigateTo
 
 from pipeprog_bringup.patrol import survey_client
 from pipeprog_bringup.patrol.round import Surveyed
-from pipeprog_bringup.patrol.survey_client import SurveyClient
+from pipeprog_bringup.patrol.survey_client import MOST_TIMES_ASKED, SurveyClient
+from pipeprog_camera.errors import InputError
 from tests.unit.bringup.patrol.fake_robot import fake_robot
 
 LOST = Surveyed(False, "the node survey is gone, and its survey with it", "")
@@ -42,4 +46,29 @@ def test_filming_is_ended_once_more_where_the_node_was_killed_before_it_answered
             client.end()
         assert client.result() == Surveyed(True, "", "/surveys/monday")
         assert robot.said == ["survey monday", "survey monday", "end"]
+        client.close()
+
+
+class Lossy(ActionClient):
+    """Hears nothing of its first goals, which the server works off all the same."""
+
+    lost = 0
+
+    def send_goal_async(self, *goal: NavigateTo.Goal) -> Future:
+        sent = super().send_goal_async(*goal)
+        self.lost -= 1
+        return sent if self.lost < 0 else Future()
+
+
+def test_a_move_is_asked_for_again_where_its_answer_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(survey_client, "ANSWER_SECONDS", 1.0)
+    with fake_robot() as robot:
+        node = rclpy.create_node("mission")
+        client, walk = SurveyClient(node), Lossy(node, NavigateTo, "spot/navigate_to")
+        walk.lost = MOST_TIMES_ASKED - 1
+        assert client.drive(walk, NavigateTo.Goal(waypoint_id="dock"), 10.0).success
+        walk.lost = MOST_TIMES_ASKED
+        with pytest.raises(InputError, match="not answered"):
+            client.drive(walk, NavigateTo.Goal(waypoint_id="gate"), 10.0)
+        assert robot.said == ["walk dock"] * MOST_TIMES_ASKED + ["walk gate"] * MOST_TIMES_ASKED
         client.close()
