@@ -61,7 +61,8 @@ class Lossy(ActionClient):
 
 
 def test_a_move_is_asked_for_again_where_its_answer_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(survey_client, "ANSWER_SECONDS", 1.0)
+    for name in ("ANSWER_SECONDS", "MATCHING_SECONDS"):
+        monkeypatch.setattr(survey_client, name, 1.0)
     with fake_robot() as robot:
         node = rclpy.create_node("mission")
         client, walk = SurveyClient(node), Lossy(node, NavigateTo, "spot/navigate_to")
