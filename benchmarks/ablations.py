@@ -43,7 +43,7 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.product.boq import load_boq
-from pipeprog_detect.types import Cloud, Pipe
+from pipeprog_detect.types import Cloud, Pipe, View
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_frames.policy.selector import FrameSelector
@@ -125,14 +125,18 @@ class Footage:
             "scale_percent": result["scale"]["error_percent"],
         }
 
-    def detect(self, taken: Map, config: DetectConfig) -> list[Pipe]:
-        """The pipes of a map, with its keyframes."""
+    def views(self, taken: Map) -> list[View]:
+        """The keyframes of a map, with their poses there."""
         store = Keyframes()
         views = []
         for stamp, pose in zip(taken.stamps.tolist(), taken.map_from_camera, strict=True):
             store.add(stamp, self.encoded[stamp], self.camera)
             views.append(store.view(stamp, pose))
-        return detect(taken.cloud, self.boq, config, views)
+        return views
+
+    def detect(self, taken: Map, config: DetectConfig) -> list[Pipe]:
+        """The pipes of a map, with its keyframes."""
+        return detect(taken.cloud, self.boq, config, self.views(taken))
 
     def chosen(self) -> list[int]:
         """The stamps of the frames that the selector takes when nobody answers it."""

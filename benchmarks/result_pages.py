@@ -129,6 +129,16 @@ PAGES = {
         "Feedback and deblurring are made for walks less even than these: see [motions](motions.md) and "
         "[deblurring](deblur.md).",
     ),
+    "joint_adjustment": Page(
+        "Poses and pipes adjusted together",
+        ("joint_adjustment",),
+        "The outlines of all pipes as observations of the poses.\n"
+        "`poses known to` is how firmly the points hold a pose, in pixels of its image; at 0 the poses stay.\n"
+        "The points place the images to 0.02 to 0.16 px, and an edge of an outline has an error of 0.05 px that all "
+        "edges of a line share: the more a pose may follow the outlines, the worse poses and radii get.\n"
+        "So there is no option for it.\n"
+        "Recordings with a rolling shutter, whose poses are less certain, have not been tried.",
+    ),
     "cloud_accuracy": Page("Clouds against the true surfaces", ("cloud_accuracy",)),
     "convergence": Page(
         "How far off a start may be",
