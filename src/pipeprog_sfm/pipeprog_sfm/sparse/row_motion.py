@@ -36,6 +36,12 @@ NEAR = 16  # views nearest in time that tell how one moves: a knot has a quarter
 # rad/s and depths of the scene per second, for each second to the next pose: how far the velocity at an end of the
 # spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
 END_CHANGE = 1.0
+# Knots of a cubic spline from an end inwards that its condition moves, each 2 - sqrt(3) times as much as the one
+# before; of the fourth it is a fiftieth.
+END_KNOTS, DECAY = 3, 2.0 - np.sqrt(3.0)
+# Views of a trajectory from which all of these follow their own rows, a quarter of it at most: of nine, six that do
+# bend the scene. In a shorter one, and in a window of the nearest views, the outermost alone do.
+LONG_TRAJECTORY = 24
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
 MAX_STEPS = 10  # of Gauss-Newton: it converges in three to six
 CONVERGED = 0.01  # px, root mean square of a step over the points, a thirtieth of their noise
@@ -78,8 +84,9 @@ def row_motions(
                     continue
                 keyframe = keyframes[own[number]]
                 motion = RowMotion(readout, keyframe.camera.height, shift, turn)
-                if number in (0, len(own) - 1):
-                    sigma = END_CHANGE * max(gaps[number], gaps[number + 1])
+                inwards = min(number, len(own) - 1 - number)
+                if inwards < (END_KNOTS if near is None and len(own) >= LONG_TRAJECTORY else 1):
+                    sigma = END_CHANGE * DECAY**inwards * max(gaps[number], gaps[number + 1])
                     motion = _fitted(model, int(part[number]), keyframe, motion, sigma)
                 found[own[number]] = motion
     return found
