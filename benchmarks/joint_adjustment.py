@@ -160,14 +160,16 @@ def rows(recording: Recording) -> list[dict[str, Any]]:
     pipes = detect(taken.cloud, footage.boq, DetectConfig(), views)
     judging = with_depths(views, taken.cloud.points)
     cylinders = [pipe.cylinder for pipe in pipes]
-    seen = [Outline.of(found) for found in outlines(cylinders, judging) if found is not None]
+    as_given = outlines(cylinders, judging)
+    seen = [Outline.of(each) for each in as_given if each is not None]
     number = {stamp: index for index, stamp in enumerate(sorted(footage.encoded))}
     truth = footage.truth.world_from_camera[[number[stamp] for stamp in stamps.tolist()]]
     table = []
     for sigma in TRIED:
         tried = moved(judging, pose_motions(seen, judging, sigma)) if sigma else judging
         map_from_camera = np.linalg.inv(np.stack([view.camera_from_map for view in tried])).astype(np.float64)
-        again = [_measured(*pair) for pair in zip(pipes, outlines(cylinders, tried), strict=True)]
+        found = outlines(cylinders, tried) if sigma else as_given
+        again = [_measured(*pair) for pair in zip(pipes, found, strict=True)]
         figures = footage.figures(again, replace(taken, map_from_camera=map_from_camera))
         errors = np.array(figures["radius_errors_mm"])
         table.append(

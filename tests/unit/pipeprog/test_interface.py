@@ -26,7 +26,7 @@ print(*[f"{pipe.class_name} {pipe.cylinder.radius:.5f}" for pipe in pipeprog.det
 
 def python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", NO_ROS + code, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
 def test_pipes_of_a_cloud_in_five_lines_without_ros() -> None:
