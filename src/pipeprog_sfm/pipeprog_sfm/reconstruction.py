@@ -340,7 +340,7 @@ class Reconstruction:
                 self._images[stamp] = EncodedImage(image.data, found.camera)
             self._deblurrer.replace_camera(found.camera)
         self._mapper.take_camera(found)
-        self._dense.clear()
+        self._dense.change_camera(found.shift)
         return True
 
     def _metric(self) -> tuple[ScaleEstimate, Trajectory]:

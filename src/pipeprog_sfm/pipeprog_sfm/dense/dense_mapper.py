@@ -41,6 +41,9 @@ LEFT_BEHIND = 0.5
 # Share of a keyframe's points that too few depth maps show, from which on it gets its own: that is what the margins of
 # a swaying image show. The sample of its points tells it with a standard deviation of 0.014.
 MARGIN = 0.04
+# px, by which changes of the camera may move a point of the image before depth maps are made anew: the one that moves
+# most; the others move by a third of it on average, about what matched patches err by.
+OUTDATED = 0.5
 STILL = RowMotion(0.0, 1, np.zeros(3), np.zeros(3))  # all rows at the stamp, however many there are
 
 
@@ -118,6 +121,7 @@ class DenseMapper:
         self._submitted: deque[Future[None]] = deque()
         self._covered: dict[int, int] = {}  # keyframes without a depth map, and the one that shows the same
         self._unsettled: deque[int] = deque()  # of these, those whose surroundings have not all got theirs
+        self._shift = 0.0  # px, at most: by which the camera has changed since the first depth map
         self._refused: dict[int, int] = {}  # keyframes without neighbours to match, and the size of the map then
         self._thread = ThreadPoolExecutor(max_workers=1, initializer=_be_nice)
         self._fusion = Fusion(fusion)  # from here on the thread's own
@@ -148,8 +152,16 @@ class DenseMapper:
         for stamp in [stamp for stamp, other in self._covered.items() if other in stamps]:
             del self._covered[stamp]
 
-    def clear(self) -> None:
-        """Gives up all depth maps and the cloud: the images have another calibration now."""
+    def change_camera(self, shift: float) -> None:
+        """Notes that another calibration or read-out moves a point of the images by `shift` px at most.
+
+        Small changes matter to the depth maps to come alone; when they add up, all depth maps and the cloud are given
+        up, to be made anew.
+        """
+        self._shift += shift
+        if self._shift <= OUTDATED:
+            return
+        self._shift = 0.0
         for known in (self._depths, self._covered, self._unsettled, self._refused, self._waiting):
             known.clear()
         self._thread.submit(self._start_anew)

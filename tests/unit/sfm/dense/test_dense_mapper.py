@@ -10,7 +10,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense import dense_mapper
-from pipeprog_sfm.dense.dense_mapper import DenseMapper, Registered
+from pipeprog_sfm.dense.dense_mapper import OUTDATED, DenseMapper, Registered
 from pipeprog_sfm.types import EncodedImage
 
 WIDTH, HEIGHT = 240, 160
@@ -112,6 +112,15 @@ def test_the_ends_of_a_walk_are_seen_as_often_as_must_agree(monkeypatch: pytest.
     settled = width([*range(8)])
     monkeypatch.setattr(dense_mapper, "MARGIN", 1.0)
     assert settled > width([*range(8)]) + STEP / CAMERA.fx
+
+
+def test_depth_maps_stay_while_the_camera_changes_by_little() -> None:
+    dense, _, _ = walk([0, 1, 2, 3])
+    count = len(dense)
+    dense.change_camera(0.6 * OUTDATED)
+    assert len(dense) == count > 0
+    dense.change_camera(0.6 * OUTDATED)  # together they move the image by too much
+    assert len(dense) == 0
 
 
 def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
