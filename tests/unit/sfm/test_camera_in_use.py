@@ -73,6 +73,10 @@ def test_a_read_out_that_is_not_told_is_found_and_said() -> None:
     assert camera.readout_sigma == pytest.approx(0.0003, rel=0.02)
     assert camera.description().endswith("the read-out is 14.80 ms (sigma 0.30 ms; not told)")
     assert camera.readout_warning() == ""
+    later = readout_found(0.0150, 0.0002, 0.0001, shift=0.3)  # a part of it, which all keyframes to come are read with
+    assert camera.is_better(later, final=False)
+    assert not camera.is_better(replace(later, shift=0.1), final=True)
+    assert not camera.is_better(readout_found(0.0148, 0.0, 0.0001, shift=0.3), final=True)
 
 
 def test_a_read_out_that_is_told_is_a_prior_and_zero_is_a_fact() -> None:
