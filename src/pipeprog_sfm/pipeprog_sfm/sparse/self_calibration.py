@@ -115,7 +115,7 @@ class _Rows:
 
 
 class _Problem:
-    """Observations of one camera in the image as it is, in units of their noise."""
+    """Observations of one camera in the image as it is, in units of their noise; `rolling`: a read-out is in use."""
 
     def __init__(
         self,
@@ -124,9 +124,10 @@ class _Problem:
         chosen: tuple[IntArray, IntArray, IntArray],
         rates: FloatArray,
         prior: FloatArray,
+        rolling: bool,
     ) -> None:
         self.ids, self.start, features = chosen
-        self.camera, self.rates, self.prior = camera, rates, prior
+        self.camera, self.rates, self.prior, self.rolling = camera, rates, prior, rolling
         self.view = model.view_of[features].astype(np.int64)
         self.owner = np.repeat(np.arange(len(self.ids)), np.diff(self.start))
         ideal = model.rays[features] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
@@ -217,8 +218,8 @@ def refine(
 ) -> Refinement | None:
     """The camera refined on a model's observations; None where there are too few.
 
-    The read-out changes only where the images contradict the one in use, and takes the camera with it only where that
-    is contradicted, too: each explains a part of what the other does.
+    The read-out changes only where the images contradict the one told, and takes the camera with it only where that is
+    contradicted, too: each explains a part of what the other does.
 
     Args:
         model: adjusted views of one camera.
@@ -237,15 +238,16 @@ def refine(
     free = told.sigmas > 0
     readout_sigma = 0.0
     if free[3]:
-        problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD))
+        problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD), readout > 0)
         change, readout_sigma = _readout_change(problem, model, np.where(free, offset, 0.0))
         least = READOUT_SHARE * readout if readout else LEAST_READOUT
-        free[3] = readout + change > 0 and abs(change) > max(SIGNIFICANT * readout_sigma, least)
+        noise = readout_sigma if readout != told.readout else SIGNIFICANT * readout_sigma
+        free[3] = readout + change > 0 and abs(change) > max(noise, least)
         if free[3] and not readout:  # what a rolling shutter bends looks like distortion: the camera's turn comes next
             free[:3] = False
     state, sigmas = _State(model.rotation, model.translation, model.points, np.zeros(4)), told.sigmas
     while free.any():
-        problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD))
+        problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD), readout > 0)
         state, sigmas = _adjusted(problem, model, np.where(free, offset, 0.0))
         determined = free & (sigmas < DETERMINED * told.sigmas)
         if determined[3] and not (np.abs(state.numbers) > SIGNIFICANT * sigmas)[:3].any():
@@ -375,9 +377,11 @@ def _moved(state: _State, poses: FloatArray, numbers: FloatArray, moves: FloatAr
 
 
 def _sigmas(reduced: _Reduced, rows: _Rows) -> FloatArray:
-    """(4,) standard deviations of the numbers: errors of points independent (sandwich covariance), with the prior.
+    """(4,) standard deviations of the numbers, with the prior.
 
-    As `function_covariance` of the bundle adjustment.
+    A sandwich covariance as `function_covariance` of the bundle adjustment, of errors that the views of a point share;
+    with a rolling shutter, where velocities are off, also of those that the features of a view share (clusters of two
+    kinds: Cameron, Gelbach, Miller, Robust Inference with Multiway Clustering, 2011).
     """
     problem = reduced.problem
     poses = -reduced.solved @ reduced.corner
@@ -385,9 +389,14 @@ def _sigmas(reduced: _Reduced, rows: _Rows) -> FloatArray:
     moves = np.stack([reduced.moves(none, *each) for each in zip(poses.T, reduced.corner, strict=True)], axis=-1)
     turned = np.concatenate([np.zeros((1, 6, 4)), poses.reshape(-1, 6, 4)])  # the first view stays
     lines = rows.by_pose @ turned[problem.view] + rows.by_number @ reduced.corner + rows.by_point @ moves[problem.owner]
-    scores = np.add.reduceat(np.einsum("kin,ki->kn", lines, rows.residuals), problem.start[:-1], axis=0)
+    scores = np.einsum("kin,ki->kn", lines, rows.residuals)
+    spread = (np.add.reduceat(scores, problem.start[:-1], axis=0) ** 2).sum(axis=0)
+    if problem.rolling:
+        of_views = np.zeros((len(turned), 4))
+        np.add.at(of_views, problem.view, scores)
+        spread += np.maximum((of_views**2).sum(axis=0) - (scores**2).sum(axis=0), 0.0)
     observed, unknown = 2 * len(problem.view), 3 * len(problem.ids) + 6 * len(turned) + 4 - 6
-    spread = np.diag(scores.T @ scores) * observed / max(observed - unknown, 1)
+    spread *= observed / max(observed - unknown, 1)
     by_prior = (reduced.corner / problem.prior[:, None]) ** 2
     return np.sqrt(spread + by_prior.sum(axis=0))
 

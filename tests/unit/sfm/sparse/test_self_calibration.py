@@ -17,6 +17,7 @@ from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 TRUE = Camera(848, 480, 600.0, 600.0, 423.5, 239.5, "plumb_bob", (0.0, 0.0, 0.0, 0.0))
 NOISE = 0.2  # px
+VELOCITY_SHIFT = 1.0  # px from the first row to the last: 0.07 rad/s or 0.2 m/s, for a read-out of 15 ms
 SIGMAS = np.array([0.003, 0.005, 0.01, 0.0])  # of a calibration; a global shutter
 
 
@@ -63,3 +64,19 @@ def test_a_right_calibration_stays() -> None:
     found = refine(*survey(TRUE, TRUE), Priors(TRUE, 0.0, SIGMAS), {})
     assert found is not None
     assert not found.is_significant
+
+
+def test_what_wrong_velocities_bend_is_no_calibration() -> None:
+    """Of a rolling shutter, they stretch and shear each view in a way of its own."""
+    rng = np.random.default_rng(0)
+    model, keyframes = survey(TRUE, TRUE)
+    for view in range(len(model)):
+        own = model.features(view)
+        rows = model.rays[own, 1:] * TRUE.fy / TRUE.height  # in heights of the image, from its middle
+        model.rays[own] += (rows * rng.normal(0.0, VELOCITY_SHIFT, 2) / TRUE.fx).astype(model.rays.dtype)
+    adjust_model(model)
+    still, rolling = (refine(model, keyframes, Priors(TRUE, readout, SIGMAS), {}) for readout in (0.0, 0.015))
+    assert still is not None
+    assert still.is_significant  # as it would be if every point erred by itself
+    assert rolling is not None
+    assert not rolling.is_significant
