@@ -20,7 +20,7 @@ from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, doubtful_views, rejection_reason
-from pipeprog_sfm.sparse.row_motion import predicted, row_motions
+from pipeprog_sfm.sparse.row_motion import predicted, row_motions, told_by_rows, unrolled_by
 from pipeprog_sfm.sparse.self_calibration import Priors, Refinement, refine
 from pipeprog_sfm.sparse.sparse_map import MAX_TURNS, SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -180,13 +180,21 @@ class Mapper:
     def _register(self, model: SparseModel, keyframe: Keyframe, views: IntArray, count: int | None) -> KeyframeReport:
         """In one model, by `count` features of some of its views; undone when the pose is rejected."""
         stamp = keyframe.stamp
-        if self.map.readout:
-            keyframe = predicted(model, keyframe, self.map.keyframes, self.map.readout)
-            self.map.keyframes[stamp] = keyframe
+        motion = predicted(model, keyframe, self.map.keyframes, self.map.readout) if self.map.readout else None
+        if motion is not None:
+            keyframe = unrolled_by(model, keyframe, motion)
         matches = self._localizer.matches(model, keyframe, views, count)
         location = self._localizer.locate(model, keyframe, matches)
+        if motion is not None and location.camera_from_model is not None:
+            # A wrong prediction bends the pose, and the pose the velocities that follow: the matches' rows tell more.
+            motion = told_by_rows(model, keyframe, location.camera_from_model, location.pairs, motion)
+            other = unrolled_by(model, keyframe, motion)
+            again = self._localizer.locate(model, other, matches)
+            if len(again.pairs) > len(location.pairs):
+                keyframe, location = other, again
         if location.camera_from_model is None:
             return KeyframeReport(stamp, False, location.reason, 0, 0.0)
+        self.map.keyframes[stamp] = keyframe
         view = add_view(model, keyframe, location, self.map.keyframes, self.map.readout)
         self.map.matches[stamp] = matches
         rejection = rejection_reason(model, view, matches)

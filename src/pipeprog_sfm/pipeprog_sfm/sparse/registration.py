@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,9 @@ LOCAL_WINDOW = 8  # views that local bundle adjustment moves: those that see a p
 # Of the points that the views around it in time hold, a share from which on a view's velocity, and so its pose, may be
 # wrong: with the velocity off by 0.7 m/s (read-out 30 ms, a path that turned) a view held 0.4 of them.
 DOUBTFUL, AROUND = 0.6, 4
+# Of the points that the views before and after a moment share, usually; with less, a few views at an end may have poses
+# and velocities of their own: 0.15 was seen at 1.4 m/s and 20 ms (two views 0.8 m off), 0.5 at ends and in turns.
+LOOSE = 0.3
 MOVED = 3  # views, with the new one, whose velocities a new view changes by more than a quarter of its own change
 
 
@@ -101,22 +104,41 @@ def rejection_reason(model: SparseModel, view: int, matches: Mapping[int, MatchA
 
 
 def doubtful_views(model: SparseModel, keyframes: Mapping[int, Keyframe]) -> list[int]:
-    """Views that hold far fewer points than the `AROUND` views of their camera nearest in time.
+    """Views that hold far fewer points than the `AROUND` views of their camera nearest in time, or hang on by few.
 
     With a rolling shutter a view that is registered before what follows it may take a wrong velocity where the camera
-    turns; features that are unrolled by it agree with a wrong pose, which confirms the velocity.
+    turns; features that are unrolled by it agree with a wrong pose, which confirms the velocity. Up to `AROUND` views
+    in a row may do so together: they share points with each other, and few with the rest.
     keyframes: at least those of the model's views, by stamp.
     """
-    held = np.array([len(model.seen(view)) for view in range(len(model))])
     frames = np.array([keyframes[stamp].frame for stamp in model.stamps])
     stamps = np.array(model.stamps)
-    doubtful = []
-    for view, stamp in enumerate(model.stamps):
-        others = np.flatnonzero((frames == frames[view]) & (stamps != stamp))
-        near = others[np.argsort(np.abs(stamps[others] - stamp), kind="stable")[:AROUND]]
-        if len(near) and held[view] < DOUBTFUL * np.median(held[near]):
-            doubtful.append(view)
-    return doubtful
+    doubtful: set[int] = set()
+    for frame in np.unique(frames):
+        own = np.flatnonzero(frames == frame)
+        own = own[np.argsort(stamps[own])]
+        seen = [model.seen(view) for view in own]
+        held = np.array([len(points) for points in seen])
+        for number, view in enumerate(own.tolist()):
+            others = np.delete(np.arange(len(own)), number)
+            near = others[np.argsort(np.abs(stamps[own[others]] - stamps[view]), kind="stable")[:AROUND]]
+            if len(near) and held[number] < DOUBTFUL * np.median(held[near]):
+                doubtful.add(view)
+        for piece in _pieces(seen):
+            if len(piece) <= AROUND and 2 * len(piece) < len(own):
+                doubtful.update(own[piece].tolist())
+    return sorted(doubtful)
+
+
+def _pieces(seen: Sequence[IntArray]) -> list[IntArray]:
+    """A trajectory cut where views share few points across a moment; `seen`: the points of each view in order."""
+    shared = np.array(
+        [
+            len(np.intersect1d(np.concatenate(seen[max(now - AROUND, 0) : now]), np.concatenate(seen[now:][:AROUND])))
+            for now in range(1, len(seen))
+        ]
+    )
+    return np.split(np.arange(len(seen)), np.flatnonzero(shared < LOOSE * np.median(shared)) + 1 if len(shared) else [])
 
 
 def epipolar_errors(model: SparseModel, view: int, other: int, matches: MatchArray) -> FloatArray:

@@ -141,18 +141,38 @@ def readout_rates(
     return rates
 
 
-def predicted(model: SparseModel, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], readout: float) -> Keyframe:
-    """The keyframe with features unrolled as if it moved like the view of its camera that is nearest in time."""
+def predicted(
+    model: SparseModel, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], readout: float
+) -> RowMotion | None:
+    """How the view of its camera that is nearest in time to the keyframe moves; None where it is unknown or far."""
     near = near_in_time(model, keyframe.stamp)
-    first = int(near[0])
-    nearest = keyframes[model.stamps[first]]
-    motion = row_motions(model, keyframes, readout, near, 1).get(nearest.stamp)
-    seen = model.points[model.seen(first)]
+    nearest = keyframes[model.stamps[int(near[0])]]
     another = (nearest.frame, nearest.camera) != (keyframe.frame, keyframe.camera)
-    if another or motion is None or not len(seen) or abs(nearest.stamp - keyframe.stamp) > MAX_GAP * 1e9:
+    if another or abs(nearest.stamp - keyframe.stamp) > MAX_GAP * 1e9:
+        return None
+    return row_motions(model, keyframes, readout, near, 1).get(nearest.stamp)
+
+
+def unrolled_by(model: SparseModel, keyframe: Keyframe, motion: RowMotion) -> Keyframe:
+    """A keyframe with features unrolled at the median depth of the view nearest in time."""
+    first = int(near_in_time(model, keyframe.stamp)[0])
+    seen = model.points[model.seen(first)]
+    if not len(seen):
         return keyframe
     depth = np.median(seen @ model.rotation[first, 2]) + model.translation[first, 2]
     return keyframe.unrolled(motion, np.full(len(keyframe.measured), depth))
+
+
+def told_by_rows(
+    model: SparseModel, keyframe: Keyframe, camera_from_model: FloatArray, pairs: IntArray, motion: RowMotion
+) -> RowMotion:
+    """How a keyframe moves by its own rows, with a predicted motion as the prior.
+
+    camera_from_model (4, 4): about its pose; pairs (K, 2): its features and the points of the model that they show.
+    """
+    gap = int(np.abs(np.array(model.stamps) - keyframe.stamp).min()) * 1e-9
+    inside = model.points[pairs[:, 1]] @ camera_from_model[:3, :3].T + camera_from_model[:3, 3]
+    return _fitted_to(inside, keyframe, pairs[:, 0], model.noise, motion, END_CHANGE * gap)
 
 
 def near_in_time(model: SparseModel, stamp: int) -> IntArray:
@@ -183,6 +203,13 @@ def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion
     features = np.flatnonzero((own >= 0) & (views[own] >= LONG_TRACK))
     inside = model.points[own[features]] @ model.rotation[view].T
     inside += model.translation[view]
+    return _fitted_to(inside, keyframe, features, model.noise, motion, sigma)
+
+
+def _fitted_to(
+    inside: FloatArray, keyframe: Keyframe, features: IntArray, noise: float, motion: RowMotion, sigma: float
+) -> RowMotion:
+    """As `_fitted`, for points (K, 3) in the camera's frame that the features (K,) of a keyframe show."""
     ahead = inside[:, 2] > 0
     features, inside = features[ahead], inside[ahead]
     if len(features) < MIN_POINTS:
@@ -202,7 +229,7 @@ def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion
         by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
         by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
         rows = np.concatenate([by_pose, times * by_pose], axis=2).reshape(-1, 12)
-        weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * model.noise) ** 2) / model.noise**2
+        weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * noise) ** 2) / noise**2
         weighted = (np.repeat(weights, 2)[:, None] * rows).T
         normal = weighted @ rows
         normal[np.arange(6, 12), np.arange(6, 12)] += precision

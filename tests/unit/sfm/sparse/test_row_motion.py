@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.registration import doubtful_views
+from pipeprog_sfm.sparse.row_motion import told_by_rows
 from pipeprog_sfm.sparse.self_calibration import Priors
 
 READOUT = 0.03  # s
@@ -90,6 +92,38 @@ def test_a_view_that_holds_far_fewer_points_than_those_around_it_is_registered_a
     mapper.finish()
     assert len(model.seen(model.stamps.index(stamp))) > 0.9 * held
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
+
+
+def test_views_at_an_end_that_hang_on_by_few_points_are_registered_anew() -> None:
+    """As two do that were placed by each other: they share points with each other, and few with the rest."""
+    mapper, truth = walk(READOUT)
+    model = mapper.map.published
+    first = [model.stamps.index(stamp) for stamp in sorted(truth)[:2]]
+    for end in first:
+        own = model.offsets[end] + np.flatnonzero(model.point_of[model.features(end)] >= 0)
+        model.point_of[own] += len(model.points)  # a copy of the points, which is theirs alone
+    model.points = np.concatenate([model.points, model.points])
+    model.translation[first] += 0.5
+    assert doubtful_views(model, mapper.map.keyframes) == sorted(first)
+    mapper.finish()
+    poses = mapper.map.camera_from_model()
+    assert list(poses) == sorted(truth)
+    assert position_errors(poses, truth).max() < 2e-3
+
+
+def test_rows_of_matches_tell_how_a_new_view_moves(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    model, keyframes = told[0].map.published, told[0].map.keyframes
+    known = told[0].map.motions(model)
+    off = np.array([0.1, -0.1, 0.1])  # rad/s
+    for stamp in sorted(known)[2:-2]:
+        number = model.stamps.index(stamp)
+        points = model.point_of[model.features(number)]
+        pairs = np.stack([np.flatnonzero(points >= 0), points[points >= 0]], axis=1)
+        wrong = replace(known[stamp], angular=known[stamp].angular + off)
+        others = copy.deepcopy(model)
+        others.stamps[number] += STEP  # the keyframe is in the model here; the nearest to a new one is a step away
+        found = told_by_rows(others, keyframes[stamp], model.pose(number), pairs, wrong)
+        assert np.linalg.norm(found.angular - known[stamp].angular) < 0.25 * np.linalg.norm(off)
 
 
 @pytest.fixture(scope="module")
