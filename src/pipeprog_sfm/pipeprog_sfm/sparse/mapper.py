@@ -20,7 +20,7 @@ from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, doubtful_views, rejection_reason
-from pipeprog_sfm.sparse.row_motion import predicted, row_motions, told_by_rows, unrolled_by
+from pipeprog_sfm.sparse.row_motion import predicted_motion, row_motions, told_by_rows, unrolled_by
 from pipeprog_sfm.sparse.self_calibration import Priors, Refinement, refine
 from pipeprog_sfm.sparse.sparse_map import MAX_TURNS, SparseMap
 from pipeprog_sfm.sparse.sparse_model import SparseModel
@@ -180,7 +180,7 @@ class Mapper:
     def _register(self, model: SparseModel, keyframe: Keyframe, views: IntArray, count: int | None) -> KeyframeReport:
         """In one model, by `count` features of some of its views; undone when the pose is rejected."""
         stamp = keyframe.stamp
-        motion = predicted(model, keyframe, self.map.keyframes, self.map.readout) if self.map.readout else None
+        motion = predicted_motion(model, keyframe, self.map.keyframes, self.map.readout) if self.map.readout else None
         if motion is not None:
             keyframe = unrolled_by(model, keyframe, motion)
         matches = self._localizer.matches(model, keyframe, views, count)

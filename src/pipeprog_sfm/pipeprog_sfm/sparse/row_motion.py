@@ -141,7 +141,7 @@ def readout_rates(
     return rates
 
 
-def predicted(
+def predicted_motion(
     model: SparseModel, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], readout: float
 ) -> RowMotion | None:
     """How the view of its camera that is nearest in time to the keyframe moves; None where it is unknown or far."""
