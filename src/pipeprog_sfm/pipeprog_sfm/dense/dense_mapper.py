@@ -121,7 +121,7 @@ class DenseMapper:
         self._submitted: deque[Future[None]] = deque()
         self._covered: dict[int, int] = {}  # keyframes without a depth map, and the one that shows the same
         self._unsettled: deque[int] = deque()  # of these, those whose surroundings have not all got theirs
-        self._shift = 0.0  # px, at most: by which the camera has changed since the first depth map
+        self._shift = 0.0  # px, at most: by which the camera has changed since depth maps were last given up
         self._refused: dict[int, int] = {}  # keyframes without neighbours to match, and the size of the map then
         self._thread = ThreadPoolExecutor(max_workers=1, initializer=_be_nice)
         self._fusion = Fusion(fusion)  # from here on the thread's own

@@ -4,7 +4,8 @@
 The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
 are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
 (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). The ends of the
-trajectory, where a spline is poor, are corrected by what their own rows tell beside points that many views hold.
+trajectory, where a spline is poor, are corrected by what their own rows tell beside points that many views hold, and
+so is what is predicted of a new view.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
