@@ -209,7 +209,7 @@ class Reconstruction:
         self._scaled = -1
         if self._reference is not None:
             self._align(self._reference)
-        self._request(settled=True, anew=True)
+        self._request(settled=True, final=True)
         return self._take()
 
     def write_colmap(self, folder: Path) -> None:
@@ -274,9 +274,11 @@ class Reconstruction:
     def request_map(self, settled: bool) -> None:
         """Starts to make a map; raises NotMetricError.
 
-        settled: no keyframe is expected soon, so that the map is of all depth maps; else of those that are there.
+        settled: no keyframe is expected soon, so that the map waits for all depth maps that can be made by now; else it
+            is of those that are there. The last keyframes get theirs with later neighbours, or in the final map: it
+            must not depend on when the stream of keyframes paused.
         """
-        self._request(settled, anew=False)
+        self._request(settled, final=False)
 
     @property
     def is_mapping(self) -> bool:
@@ -291,12 +293,12 @@ class Reconstruction:
         motions = self._map.motions(self._map.published)
         return Registered(self._map.camera_from_model(), self._images, self._map.points_seen, motions)
 
-    def _request(self, settled: bool, anew: bool) -> None:
-        if settled:
+    def _request(self, settled: bool, final: bool) -> None:
+        if final:
             self._dense.update(self._registered(), complete=True)
         scale, trajectory = self._metric()
         camera_from_map = dict(zip(trajectory.stamps.tolist(), np.linalg.inv(trajectory.map_from_camera), strict=True))
-        cloud = self._dense.fuse(camera_from_map, self._map.camera_from_model(), scale.scale, settled, anew)
+        cloud = self._dense.fuse(camera_from_map, self._map.camera_from_model(), scale.scale, settled, anew=final)
         self._pending = scale, trajectory, cloud
 
     def _take(self) -> MetricMap:
