@@ -121,7 +121,8 @@ class DenseMapper:
         self._submitted: deque[Future[None]] = deque()
         self._covered: dict[int, int] = {}  # keyframes without a depth map, and the one that shows the same
         self._unsettled: deque[int] = deque()  # of these, those whose surroundings have not all got theirs
-        self._shift = 0.0  # px, at most: by which the camera has changed since depth maps were last given up
+        self._shift = 0.0  # px, at most: by which the camera has changed since the first keyframe
+        self._started_at: dict[int, float] = {}  # that shift when a depth map was started
         self._refused: dict[int, int] = {}  # keyframes without neighbours to match, and the size of the map then
         self._thread = ThreadPoolExecutor(max_workers=1, initializer=_be_nice)
         self._fusion = Fusion(fusion)  # from here on the thread's own
@@ -148,23 +149,23 @@ class DenseMapper:
         for stamp in stamps:
             self._refused.pop(stamp, None)
             self._covered.pop(stamp, None)
-            self._depths.pop(stamp, None)
+            if stamp in self._depths:
+                self._depths.pop(stamp).cancel()
+                del self._started_at[stamp]
         for stamp in [stamp for stamp, other in self._covered.items() if other in stamps]:
             del self._covered[stamp]
 
     def change_camera(self, shift: float) -> None:
         """Notes that another calibration or read-out moves a point of the images by `shift` px at most.
 
-        Small changes matter to the depth maps to come alone; when they add up, all depth maps and the cloud are given
-        up, to be made anew.
+        Small changes matter to the depth maps to come alone; those that were made before changes that add up to more
+        than OUTDATED are given up, with the cloud, to be made anew.
         """
         self._shift += shift
-        if self._shift <= OUTDATED:
-            return
-        self._shift = 0.0
-        for known in (self._depths, self._covered, self._unsettled, self._refused, self._waiting):
-            known.clear()
-        self._thread.submit(self._start_anew)
+        outdated = [stamp for stamp, start in self._started_at.items() if self._shift - start > OUTDATED]
+        if outdated:
+            self.retire(outdated)
+            self._thread.submit(self._start_anew)
 
     def fuse(
         self,
@@ -238,9 +239,11 @@ class DenseMapper:
             _Source(other, images[other], poses[other], _motion(keyframes.motions, other)) for other in [stamp, *pairs]
         ]
         future: Future[_Depth] = Future()
-        self._depths[stamp] = future
+        self._depths[stamp], self._started_at[stamp] = future, self._shift
 
         def make() -> None:
+            if not future.set_running_or_notify_cancel():
+                return
             try:
                 future.set_result(self._depth(views, depth_range))
             except BaseException as error:
@@ -279,7 +282,7 @@ class DenseMapper:
         if anew or max(moved, default=0.0) > self._fusion_config.voxel:
             self._start_anew()
         for stamp, (future, pose) in maps.items():
-            if stamp in self._fused:
+            if stamp in self._fused or future.cancelled():  # given up since
                 continue
             depth = future.result()
             left = [other for other in depth.baselines if other in camera_from_model]

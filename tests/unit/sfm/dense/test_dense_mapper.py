@@ -123,6 +123,24 @@ def test_depth_maps_stay_while_the_camera_changes_by_little() -> None:
     assert len(dense) == 0
 
 
+def test_only_the_depth_maps_of_an_earlier_camera_are_made_anew() -> None:
+    places = list(range(0, 24, 2))  # too far apart to show the same
+    poses, images = {place: pose(place) for place in places}, {place: image(place) for place in places}
+    half = {place: poses[place] for place in places[:6]}
+    dense = DenseMapper(StereoConfig(), FusionConfig())
+    dense.update(Registered(half, images, lambda other: seen(half[other])), complete=False)
+    early = len(dense)
+    dense.change_camera(0.6 * OUTDATED)
+    dense.update(Registered(poses, images, lambda other: seen(poses[other])), complete=True)
+    whole = len(dense)
+    dense.change_camera(0.6 * OUTDATED)
+    assert len(dense) == whole - early > 0
+    dense.update(Registered(poses, images, lambda other: seen(poses[other])), complete=True)
+    assert len(dense) == whole
+    cloud = dense.fuse(poses, poses, 1.0, complete=True, anew=True).result()
+    assert np.median(np.abs(cloud.points[:, 2] - 1.0)) < 0.003
+
+
 def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
     places = [place for place in range(8) for _ in range(2)]
     dense, poses, counts = walk(places)
@@ -134,3 +152,10 @@ def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
     dense.update(Registered(left, images, lambda other: seen(left[other])), complete=True)
     assert len(dense) > after
     assert len(dense.fuse(left, left, 1.0, complete=True, anew=True).result().points) > 1000
+
+
+def test_a_depth_map_may_be_retired_while_a_cloud_of_it_is_awaited() -> None:
+    dense, poses, _ = walk(list(range(12)))
+    cloud = dense.fuse(poses, poses, 1.0, complete=True, anew=True)
+    dense.retire([max(poses)])
+    assert len(cloud.result().points) > 1000
