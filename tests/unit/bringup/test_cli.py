@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -13,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeprog_bringup import cli
 from pipeprog_bringup.results.cloud_io import write_ply
 from pipeprog_detect.types import Cylinder
 from tests.unit.bringup.recordings import write_bag
@@ -31,17 +34,24 @@ def pipeprog(*arguments: str | Path, cwd: Path | None = None, **environment: str
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=known, timeout=120, check=False)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bill, a recording, and a cloud of one pipe of 36.5 mm in front of a wall."""
-    (tmp_path / "boq.yaml").write_text(BOQ)
-    write_bag(tmp_path / "bag.mcap")
+    folder = tmp_path_factory.mktemp("made")
+    (folder / "boq.yaml").write_text(BOQ)
+    write_bag(folder / "bag.mcap")
     rng = np.random.default_rng(0)
     turn, height = rng.uniform(-1.3, 1.3, 20_000), rng.uniform(0, 1.5, 20_000)
     pipe = np.stack([0.0365 * np.sin(turn), -0.1 - 0.0365 * np.cos(turn), height], axis=1)
     wall = rng.uniform([-0.5, -0.001, 0], [0.5, 0.001, 1.5], (40_000, 3))
-    write_ply(tmp_path / "cloud.ply", np.concatenate([pipe, wall]))
-    return tmp_path
+    write_ply(folder / "cloud.ply", np.concatenate([pipe, wall]))
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    """What was `made`, for one test alone."""
+    return shutil.copytree(made, tmp_path, dirs_exist_ok=True)
 
 
 def test_help_names_every_command() -> None:
@@ -161,17 +171,34 @@ BAD = [
 ]
 
 
+def test_a_process_with_bad_input_ends_with_1_and_without_a_traceback(folder: Path) -> None:
+    result = pipeprog("replay", "absent.mcap", "--boq", "boq.yaml", "--out", "out", cwd=folder)
+    assert result.returncode == 1
+    assert "no such bag: absent.mcap" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
 @pytest.mark.parametrize(("arguments", "expected"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_is_1_and_says_what_is_wrong(folder: Path, arguments: tuple[str, ...], expected: str) -> None:
+def test_bad_input_is_1_and_says_what_is_wrong(
+    folder: Path,
+    arguments: tuple[str, ...],
+    expected: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """In this process: to start one for each takes most of the time."""
     (folder / "bad.yaml").write_text("clases: []\n")
     (folder / "boards.yaml").write_text(BOARDS)
     (folder / "used").mkdir()
     (folder / "used" / "mine.txt").write_text("keep")
     before = sorted(folder.rglob("*"))
-    result = pipeprog(*arguments, cwd=folder)
-    assert result.returncode == 1
-    assert expected in result.stderr
-    assert "Traceback" not in result.stderr
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["pipeprog", *arguments])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 1
+    assert expected in capsys.readouterr().err
     assert sorted(folder.rglob("*")) == before
 
 
