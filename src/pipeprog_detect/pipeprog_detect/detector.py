@@ -24,7 +24,7 @@ from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.false_lines import is_false_line, is_one_step
 from pipeprog_detect.thin.hangers import is_hanger
-from pipeprog_detect.thin.thin_pipes import find_thin_pipes
+from pipeprog_detect.thin.thin_pipes import find_thin_pipes, turned_parallel
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.grown_ends import with_grown_ends
@@ -166,6 +166,7 @@ def detect_outside(
 
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
     report(0.95, "looking for thin pipes in the keyframes")
+    measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(points, around, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)

@@ -17,7 +17,7 @@ from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
-from pipeprog_detect.thin.axis_sweep import Proposal, propose_parallel
+from pipeprog_detect.thin.axis_sweep import propose_parallel
 from pipeprog_detect.thin.corners import is_corner
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_false_line
@@ -109,12 +109,58 @@ def find_thin_pipes(
     before_walls = [each for each in swept if not is_no_pipe(each.cylinder)]
     for parallel in before_walls[:MOST_PROPOSED]:
         if not is_known(parallel.cylinder, known) and not is_rival(parallel.cylinder):
-            consider(lines.along_known_pipes(parallel, known))
+            consider(lines.along_known_pipes(parallel.cylinder, parallel.depth_sigma, known))
     for proposed in propose(seen, some, radii, MOST_PROPOSED):
         if not is_known(proposed, known) and not is_rival(proposed):
             fit = lines.measure(proposed, known, follow=False)
             consider(None if fit is None else lines.follow(fit, proposed.radius, known))
     return thin
+
+
+def turned_parallel(
+    measured: Sequence[MeasuredPipe],
+    points: NDArray[np.floating],
+    thickest: float,
+    views: Sequence[View],
+    boq: BillOfQuantities,
+) -> list[MeasuredPipe]:
+    """The pipes; thin ones that run nearly along several others are parallel to these where that is more probable.
+
+    The contour of a thin pipe of which the cloud shows a short piece is followed for metres in the direction of that
+    piece: seen from one height, its image fits at a wrong slope, too, and the fit ends in the optimum nearest to it.
+
+    Args:
+        measured: all pipes.
+        points: of the cloud (N, 3).
+        thickest: largest radius [m].
+        views: the keyframes.
+        boq: the bill of quantities.
+    """
+    radii = [radius for radius in boq.radii if radius < thickest]
+    if not views or not radii:
+        return list(measured)
+    lines = _LineFitter(views, points.astype(np.float32, copy=False), radii, boq)
+    cylinders = [each.cylinder for each in measured]
+    turned_ones = list(measured)
+    for number, each in enumerate(measured):
+        others = cylinders[:number] + cylinders[number + 1 :]
+        direction = _other_direction(each.cylinder, others) if each.cylinder.radius < thickest else None
+        if each.fit is None or direction is None:
+            continue
+        radius = min(radii, key=lambda planned: abs(planned - each.cylinder.radius))
+        start = turned(replace(each.cylinder, radius=radius), direction, views)
+        fit = lines.along_known_pipes(start, LINE_DEPTH_SIGMA, others)
+        if fit is not None and fit.log_odds > each.fit.log_odds:
+            turned_ones[number] = MeasuredPipe.of_contour(each.candidate, fit)
+    return turned_ones
+
+
+def _other_direction(cylinder: Cylinder, others: Sequence[Cylinder]) -> FloatArray | None:
+    """The direction (3,) that several others have and the cylinder nearly has; None without one, and if it has it."""
+    near = max(parallel_directions(others), key=lambda each: abs(float(each @ cylinder.axis)), default=None)
+    if near is None or not np.cos(NEARLY_PARALLEL) < abs(float(near @ cylinder.axis)) < np.cos(PARALLEL_SIGMA):
+        return None
+    return near
 
 
 def is_shadow(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
@@ -137,13 +183,12 @@ class _LineFitter:
     radii: Sequence[float]
     boq: BillOfQuantities
 
-    def along_known_pipes(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
-        """The whole of a pipe of which the direction is known; None where its contour is not seen.
+    def along_known_pipes(self, start: Cylinder, depth_sigma: float, known: Sequence[Cylinder]) -> ContourFit | None:
+        """The whole of a pipe that has the direction of `start`; None where its contour is not seen.
 
         Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
         away looks the same, from where the cloud has it, too, and the most probable fit counts.
         """
-        start, depth_sigma = proposal.cylinder, proposal.depth_sigma
         if depth_sigma <= DEPTH_SIGMA * start.radius:
             return self._parallel(start, depth_sigma, known)
         centre = mean_centre(start, self.views)

@@ -29,6 +29,9 @@ _STEP, _BESIDE, _LEAST_BESIDE = 0.05, 3.0, 0.03
 # They are looked at before and behind it up to this many times as far (walls aslant to the view). The median of three
 # points tells where a wall is, one of them being astray.
 _ASLANT, _LEAST_POINTS = 3.0, 3
+# Share of a cylinder beside seen walls that tells whether all of it is in one: it is straight. Less than a quarter may
+# be where a pipe comes out of a wall.
+_TOLD = 0.25
 # A cylinder whose axis lies behind the wall, or before it by less than this share of the radius, is in it.
 _IN_WALL = 0.5
 # Walls deviate from a plane by this much [m] over that width.
@@ -86,7 +89,9 @@ class SceneContext:
         return any(float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner) for corner in corners)
 
     def is_embedded(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
-        """Whether more than half of the cylinder, looked at along `towards` (3,), would lie within walls.
+        """Whether the cylinder, looked at along `towards` (3,), would lie within walls where these are seen beside it.
+
+        That is so along more than half of what is beside seen walls, which must be `_TOLD` of it at least.
 
         The contour is where the line of sight touches the cylinder, beside its axis and hardly nearer: a wall whose
         own face is nearer than the axis on both sides would hide both lines. The depth that the views tell may be
@@ -100,25 +105,34 @@ class SceneContext:
         bins = max(int(cylinder.length / _STEP), 4)
         place = np.clip((offset @ cylinder.axis / cylinder.length * bins).astype(np.int64), 0, bins - 1)
         surface = _IN_WALL * cylinder.radius - self._clear(radius_sigma)
-        buried = 0
+        told = buried = 0
         for step in range(bins):
             beside = (place == step) & (np.abs(aside) > cylinder.radius) & (np.abs(aside) < reach)
             flanks = [behind[beside & (side * aside > 0)] for side in (-1.0, 1.0)]
-            buried += all(len(flank) >= _LEAST_POINTS and np.median(flank) < surface for flank in flanks)
-        return buried > 0.5 * bins
+            if all(len(flank) >= _LEAST_POINTS for flank in flanks):
+                told += 1
+                buried += all(np.median(flank) < surface for flank in flanks)
+        return told >= _TOLD * bins and buried > 0.5 * told
 
     def touches_wall(self, cylinder: Cylinder) -> bool:
         """Whether a wall is as near to the axis as the radius, along more than half of the cylinder.
 
-        Lines on a wall, such as shadows, joints and its corner with the next one, look like a thin pipe on it.
+        Lines on a wall, such as shadows, joints and its corner with the next one, look like a thin pipe on it. In a
+        corner stereo shows neither wall: a wall that ends beside the cylinder goes on to it.
         """
         nearest = cylinder.radius + self.clearance
-        offset = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, nearest)]
-        along = cylinder.along(offset)
-        near = np.linalg.norm(cylinder.from_axis(offset), axis=1) < nearest
-        near &= (along > 0.0) & (along < cylinder.length)
+        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, nearest + _LEAST_BESIDE)]
+        along = cylinder.along(points)
+        within = (along > 0.0) & (along < cylinder.length)
+        points, along = points[within], along[within]
+        foot = cylinder.at(along / cylinder.length)
+        touching = np.linalg.norm(points - foot, axis=1) < nearest
+        for plane in self.planes:
+            if abs(plane.normal @ cylinder.axis) < ALONG:
+                from_points, from_axis = (np.abs(each @ plane.normal - plane.offset) for each in (points, foot))
+                touching |= (from_points < self.clearance) & (from_axis < nearest)
         steps = max(int(cylinder.length / _STEP), 4)
-        return len(np.unique((along[near] / cylinder.length * steps).astype(np.int64))) > 0.5 * steps
+        return len(np.unique((along[touching] / cylinder.length * steps).astype(np.int64))) > 0.5 * steps
 
     @property
     def clearance(self) -> float:

@@ -9,10 +9,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.thin.thin_pipes import NEARLY_PARALLEL, _LineFitter, aligned, is_shadow, turned
-from pipeprog_detect.types import Cylinder
+from pipeprog_detect.thin.thin_pipes import (
+    NEARLY_PARALLEL,
+    _LineFitter,
+    aligned,
+    is_shadow,
+    turned,
+    turned_parallel,
+)
+from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from tests.unit.detect.straight_ahead import looking_along_y
 
 
@@ -39,6 +48,40 @@ def test_a_slope_that_may_be_wrong_is_that_of_the_pipes_beside(slope: float, kno
     else:
         assert not np.isfinite(sigma)
         assert found == proposed
+
+
+def measured(cylinder: Cylinder, log_odds: float) -> MeasuredPipe:
+    """A pipe whose contour has these odds."""
+    across = np.asarray(np.cross(cylinder.axis, np.eye(3)[1:]), np.float64)
+    fit = ContourFit(cylinder, across, np.eye(5), 1e-4, 0.9, log_odds, 20, (0.0, 0.0), 0.0, 0.1)
+    return MeasuredPipe.of_contour(Candidate(cylinder, 1e-4, 100, CloudEvidence(np.pi, 0.9, 0.0, 1e-3, 0.0, 3.0)), fit)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "log_odds", "is_turned"),
+    [(0.5, 110.0, True), (0.5, 90.0, False), (0.2, 110.0, False), (4.5, 110.0, True), (5.5, 110.0, False)],
+)
+def test_a_thin_pipe_is_turned_parallel_to_others_where_that_is_more_probable(
+    degrees: float, log_odds: float, is_turned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its contour as measured has odds of 100 (logarithm), and of `log_odds` where it is parallel to the others."""
+    started = []
+
+    def along(self: _LineFitter, start: Cylinder, depth_sigma: float, known: list[Cylinder]) -> ContourFit | None:
+        started.append(start)
+        return measured(start, log_odds).fit
+
+    monkeypatch.setattr(_LineFitter, "along_known_pipes", along)
+    boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    views: list[View] = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    beside = [measured(Cylinder(each.start, each.end, 0.05), 100.0) for each in (level(1.0), level(2.0), level(3.0))]
+    given_pipes = [*beside, measured(level(0.7, np.radians(degrees)), 100.0)]
+    *others, after = turned_parallel(given_pipes, np.zeros((0, 3)), 0.02, views, boq)
+    assert others == beside  # thick ones stay
+    assert (after is not given_pipes[-1]) is is_turned
+    if is_turned:
+        assert after.cylinder == started[0]
+        assert abs(float(after.cylinder.axis @ level(1.0).axis)) > np.cos(1e-6)
 
 
 @settings(max_examples=30, deadline=None)

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
+from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.scene_context import SceneContext
 
@@ -30,9 +33,9 @@ BACK = wall([-0.5, 0.0, 0.0], [0.5, 0.0, 1.0])
 SIDE = wall([-0.5, -1.0, 0.0], [-0.5, 0.0, 1.0])
 
 
-def surroundings(*walls: FloatArray) -> SceneContext:
+def surroundings(*walls: FloatArray, planes: Sequence[Plane] = ()) -> SceneContext:
     points = octree.build(np.concatenate([np.array([[9.0, 9.0, 9.0]]), *walls]))
-    return SceneContext(points, None, [], points, SIGMA)
+    return SceneContext(points, None, planes, points, SIGMA)
 
 
 def upright(x: float, y: float, radius: float = RADIUS, low: float = 0.1, high: float = 0.9) -> Cylinder:
@@ -75,6 +78,13 @@ def test_a_pipe_that_leaves_the_wall_for_most_of_its_length_stands() -> None:
     assert surroundings(low, high).is_embedded(upright(0.0, -RADIUS, high=0.6), 1e-4, AWAY)
 
 
+@pytest.mark.parametrize(("seen", "embedded"), [(0.3, True), (0.1, False)])
+def test_a_line_in_a_wall_is_embedded_though_most_of_the_wall_is_not_seen(seen: float, embedded: bool) -> None:
+    """`seen`: how far up the wall is seen beside 0.8 m of the line [m]."""
+    part = wall([-0.5, 0.0, 0.1], [0.5, 0.0, 0.1 + seen])
+    assert surroundings(part).is_embedded(upright(0.0, 0.006), 1e-4, AWAY) is embedded
+
+
 def test_without_walls_nothing_is_embedded() -> None:
     assert not surroundings().is_embedded(upright(0.0, 0.0), 1e-4, AWAY)
 
@@ -88,3 +98,11 @@ def test_what_is_no_farther_from_a_wall_than_its_radius_touches_it(before: float
 def test_a_pipe_that_ends_at_a_wall_does_not_touch_it() -> None:
     beside = Cylinder(np.array([0.0, -0.8, 0.5]), np.array([0.0, 0.0, 0.5]), RADIUS)
     assert not surroundings(BACK).touches_wall(beside)
+
+
+@pytest.mark.parametrize(("gap", "before", "touches"), [(0.025, 0.5, True), (0.025, 1.8, False), (0.06, 0.5, False)])
+def test_a_wall_that_ends_beside_a_line_goes_on_to_it(gap: float, before: float, touches: bool) -> None:
+    """`gap` [m]: from the wall's last points to the axis; `before`: distance of the axis from its plane, in radii."""
+    ends = wall([gap, 0.0, 0.0], [0.5, 0.0, 1.0])
+    around = surroundings(ends, planes=[Plane(AWAY, 0.0, 0.5)])
+    assert around.touches_wall(upright(0.0, -before * RADIUS)) is touches
