@@ -166,10 +166,10 @@ def detect_outside(
 
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
     report(0.95, "looking for thin pipes in the keyframes")
-    measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(points, around, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
+    measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)
     measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
     whole = _judged(with_open_ends(joined(measured, judging), around, judging), judging, has_two_edges)
     ended = _abutted(with_grown_ends(whole, judging), around, judging)

@@ -17,7 +17,7 @@ from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
-from pipeprog_detect.thin.axis_sweep import propose_parallel
+from pipeprog_detect.thin.axis_sweep import Proposal, propose_parallel
 from pipeprog_detect.thin.corners import is_corner
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_false_line
@@ -48,6 +48,9 @@ LINE_DEPTH_SIGMA = 0.03
 TOUCHING = 2.0
 # Their axes are known to this [m].
 AXIS_SIGMA = 1e-3
+# Standard deviation of a slope to which a fit is held [rad]: a tenth of that of parallel pipes; and what its axis is
+# then known to [m]: a length of six metres ends 3 mm aside by it.
+DIRECTION_HELD, HELD_AXIS = 0.1 * PARALLEL_SIGMA, 2e-3
 
 
 def find_thin_pipes(
@@ -109,7 +112,7 @@ def find_thin_pipes(
     before_walls = [each for each in swept if not is_no_pipe(each.cylinder)]
     for parallel in before_walls[:MOST_PROPOSED]:
         if not is_known(parallel.cylinder, known) and not is_rival(parallel.cylinder):
-            consider(lines.along_known_pipes(parallel.cylinder, parallel.depth_sigma, known))
+            consider(lines.along_known_pipes(parallel, known))
     for proposed in propose(seen, some, radii, MOST_PROPOSED):
         if not is_known(proposed, known) and not is_rival(proposed):
             fit = lines.measure(proposed, known, follow=False)
@@ -126,8 +129,8 @@ def turned_parallel(
 ) -> list[MeasuredPipe]:
     """The pipes; thin ones that run nearly along several others are parallel to these where that is more probable.
 
-    The contour of a thin pipe of which the cloud shows a short piece is followed for metres in the direction of that
-    piece: seen from one height, its image fits at a wrong slope, too, and the fit ends in the optimum nearest to it.
+    Seen from one height, the image of a thin pipe fits at a wrong slope, too, and a fit that has followed it for metres
+    ends in the optimum nearest to the direction of the piece that it began with.
 
     Args:
         measured: all pipes.
@@ -149,9 +152,9 @@ def turned_parallel(
             continue
         radius = min(radii, key=lambda planned: abs(planned - each.cylinder.radius))
         start = turned(replace(each.cylinder, radius=radius), direction, views)
-        fit = lines.along_known_pipes(start, LINE_DEPTH_SIGMA, others)
-        if fit is not None and fit.log_odds > each.fit.log_odds:
-            turned_ones[number] = MeasuredPipe.of_contour(each.candidate, fit)
+        best = max(lines.in_direction(start, others), key=lambda fit: fit.log_odds, default=each.fit)
+        if best.log_odds > each.fit.log_odds:
+            turned_ones[number] = MeasuredPipe.of_contour(each.candidate, best)
     return turned_ones
 
 
@@ -183,12 +186,13 @@ class _LineFitter:
     radii: Sequence[float]
     boq: BillOfQuantities
 
-    def along_known_pipes(self, start: Cylinder, depth_sigma: float, known: Sequence[Cylinder]) -> ContourFit | None:
-        """The whole of a pipe that has the direction of `start`; None where its contour is not seen.
+    def along_known_pipes(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
+        """The whole of a pipe of which the direction is known; None where its contour is not seen.
 
         Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
         away looks the same, from where the cloud has it, too, and the most probable fit counts.
         """
+        start, depth_sigma = proposal.cylinder, proposal.depth_sigma
         if depth_sigma <= DEPTH_SIGMA * start.radius:
             return self._parallel(start, depth_sigma, known)
         centre = mean_centre(start, self.views)
@@ -217,6 +221,15 @@ class _LineFitter:
         seen = [fit for fit in fits if fit is not None]
         good = (fit for fit in seen if self._accepts(fit, known, PARALLEL_CONVINCING))
         return next(good, None)
+
+    def in_direction(self, start: Cylinder, known: Sequence[Cylinder]) -> list[ContourFit]:
+        """The accepted fits of a whole pipe: in the direction of `start`, and, from there, near this direction."""
+        held = refine(Start(start, start.radius, True, LINE_DEPTH_SIGMA, DIRECTION_HELD), self.views, known, self.radii)
+        if held is None:
+            return []
+        near = refine(Start(held.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA), self.views, known, self.radii)
+        fits = [held] if near is None else [held, near]
+        return [fit for fit in fits if self._accepts(fit, known, PARALLEL_CONVINCING)]
 
     def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
         """The whole of a pipe of the given radius [m] of which a piece was found.

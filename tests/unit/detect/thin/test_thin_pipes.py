@@ -67,11 +67,11 @@ def test_a_thin_pipe_is_turned_parallel_to_others_where_that_is_more_probable(
     """Its contour as measured has odds of 100 (logarithm), and of `log_odds` where it is parallel to the others."""
     started = []
 
-    def along(self: _LineFitter, start: Cylinder, depth_sigma: float, known: list[Cylinder]) -> ContourFit | None:
+    def fits(self: _LineFitter, start: Cylinder, known: list[Cylinder]) -> list[ContourFit]:
         started.append(start)
-        return measured(start, log_odds).fit
+        return [each.fit for odds in (80.0, log_odds) if (each := measured(start, odds)).fit is not None]
 
-    monkeypatch.setattr(_LineFitter, "along_known_pipes", along)
+    monkeypatch.setattr(_LineFitter, "in_direction", fits)
     boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     views: list[View] = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     beside = [measured(Cylinder(each.start, each.end, 0.05), 100.0) for each in (level(1.0), level(2.0), level(3.0))]
