@@ -48,8 +48,8 @@ LINE_DEPTH_SIGMA = 0.03
 TOUCHING = 2.0
 # Their axes are known to this [m].
 AXIS_SIGMA = 1e-3
-# Standard deviation of a slope to which a fit is held [rad]: a tenth of that of parallel pipes, so that the search keeps
-# to it. From its middle the ends of six metres are then 2 mm aside: its axis is known to this [m].
+# Standard deviation of a slope to which a fit is held [rad]: a tenth of that of parallel pipes, so that the search
+# keeps to it. From its middle the ends of six metres are then 2 mm aside: its axis is known to this [m].
 DIRECTION_HELD, HELD_AXIS = 0.1 * PARALLEL_SIGMA, 2e-3
 
 
