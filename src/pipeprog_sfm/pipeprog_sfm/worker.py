@@ -152,8 +152,8 @@ def work(
 ) -> None:
     """As `serve`; `clock` tells seconds.
 
-    A map is requested after `map_interval` keyframes, and one of all there is when no command has come for
-    IDLE_SECONDS; with None, no map but the last.
+    A map is requested after `map_interval` keyframes, and one of all depth maps that can be made by then when no
+    command has come for IDLE_SECONDS; with None, no map but the last.
     """
     for earlier in answered:
         _answer(reconstruction, earlier)
