@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -69,24 +70,41 @@ class SceneContext:
     def rejects(self, candidate: Candidate) -> bool:
         """Whether a candidate is no pipe: it is hollow, or the rounding of the edge or corner of two planes.
 
-        Such a rounding is tangent to both planes, and lies where they would meet; a pipe in a corner shows its other
-        side.
+        Such a rounding is tangent to both planes, which are seen beside it, and lies where they would meet; a pipe in a
+        corner shows its other side.
         """
         outwardness = self.outwardness(candidate)
         if outwardness is not None and outwardness < _OUTWARD:
             return True
         cylinder = candidate.cylinder
         allowed = _TANGENT * cylinder.radius + 3.0 * candidate.band
-        feet = []
+        tangent = []
         for plane in self.planes:
             away = plane.offset - float(plane.normal @ cylinder.middle)
             if abs(plane.normal @ cylinder.axis) < ALONG and abs(abs(away) - cylinder.radius) < allowed:
-                feet.append(np.sign(away) * plane.normal)
-        corners = [one + other for k, one in enumerate(feet) for other in feet[:k] if abs(float(one @ other)) < CORNER]
+                tangent.append((plane, np.sign(away) * plane.normal))
+        corners = [
+            towards_one + towards_other
+            for (one, towards_one), (other, towards_other) in combinations(tangent, 2)
+            if abs(float(towards_one @ towards_other)) < CORNER
+            and self._runs_beside(one, other, cylinder)
+            and self._runs_beside(other, one, cylinder)
+        ]
         if not corners:
             return False
         front = self._surface(candidate)[1].mean(axis=0)
         return any(float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner) for corner in corners)
+
+    def _runs_beside(self, plane: Plane, other: Plane, cylinder: Cylinder) -> bool:
+        """Whether points of the plane, and not of the other, lie beside more than half of the cylinder.
+
+        A plane is known by its normal and offset: what was seen of it may be far away.
+        """
+        reach = cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE)
+        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, reach)]
+        on_plane, on_other = (np.abs(points @ each.normal - each.offset) < self.clearance for each in (plane, other))
+        share = cylinder.along(points[on_plane & ~on_other]) / cylinder.length
+        return _is_along_half(cylinder, share[(share > 0.0) & (share < 1.0)])
 
     def is_embedded(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
         """Whether the cylinder, looked at along `towards` (3,), would lie within walls where these are seen beside it.
@@ -131,8 +149,7 @@ class SceneContext:
             if abs(plane.normal @ cylinder.axis) < ALONG:
                 from_points, from_axis = (np.abs(each @ plane.normal - plane.offset) for each in (points, foot))
                 touching |= (from_points < self.clearance) & (from_axis < nearest)
-        steps = max(int(cylinder.length / _STEP), 4)
-        return len(np.unique((along[touching] / cylinder.length * steps).astype(np.int64))) > 0.5 * steps
+        return _is_along_half(cylinder, along[touching] / cylinder.length)
 
     @property
     def clearance(self) -> float:
@@ -151,3 +168,9 @@ class SceneContext:
         distance = np.linalg.norm(radial, axis=1)
         near = np.abs(distance - cylinder.radius) < 3.0 * candidate.band
         return rows[near], radial[near] / (distance[near] + 1e-12)[:, None]
+
+
+def _is_along_half(cylinder: Cylinder, share: FloatArray) -> bool:
+    """Whether points at these shares (N,) of its length, 0 to 1, lie along more than half of a cylinder."""
+    steps = max(int(cylinder.length / _STEP), 4)
+    return len(np.unique((share * steps).astype(np.int64))) > 0.5 * steps

@@ -10,6 +10,7 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
+from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -106,3 +107,20 @@ def test_a_wall_that_ends_beside_a_line_goes_on_to_it(gap: float, before: float,
     ends = wall([gap, 0.0, 0.0], [0.5, 0.0, 1.0])
     around = surroundings(ends, planes=[Plane(AWAY, 0.0, 0.5)])
     assert around.touches_wall(upright(0.0, -before * RADIUS)) is touches
+
+
+@pytest.mark.parametrize(("low", "high", "rejected"), [(0.0, 1.0, True), (0.45, 1.0, True), (0.7, 1.0, False)])
+def test_the_rounding_of_a_corner_is_one_of_planes_that_are_seen_beside_it(
+    low: float, high: float, rejected: bool
+) -> None:
+    """`low`, `high` [m]: where one of the two planes begins and ends; the candidate reaches from 0.1 to 0.9 m."""
+    radius = 0.03
+    back, side = Plane(AWAY, 0.0, 1.0), Plane(np.array([1.0, 0.0, 0.0]), -0.5, 1.0)
+    rounding = upright(-0.5 + radius, -radius, radius)
+    angle = np.linspace(0.5 * np.pi, np.pi, 50)  # the quarter of its section that faces the corner
+    section = np.stack([np.cos(angle), np.sin(angle)], axis=1) * radius + rounding.start[:2]
+    surface = np.concatenate([np.column_stack([section, np.full(50, z)]) for z in np.arange(0.1, 0.9, SPACING)])
+    walls = octree.build(np.concatenate([BACK, wall([-0.5, -1.0, low], [-0.5, 0.0, high])]))
+    around = SceneContext(octree.build(surface), None, [back, side], walls, SIGMA)
+    evidence = CloudEvidence(arc=0.5 * np.pi, coverage=1.0, inside=0.0, noise=SIGMA, roundness=0.0, flatness=100.0)
+    assert around.rejects(Candidate(rounding, 1e-3, len(surface), evidence)) is rejected
