@@ -40,6 +40,8 @@ _BLURRED_ACROSS, _BLURRED_VARIANCE, _BLURRED_LEAST, _BLURRED_SIGMA = 0.65, 0.355
 _BLURRED_NOISE_SIGMA = 1.5 * 0.5
 # A flange or a cap covers this length of an end [m], beside what the noise smears: points of it are not fitted.
 _CAP = 0.015
+# A stretch of surface that continues a pipe beyond a gap is as long as this share of it at least: less is chance.
+_BRIDGING = 0.25
 # Shorter pieces of surface [m] (or than half a radius) are stray points.
 _LEAST_PIECE = 0.015
 
@@ -109,7 +111,7 @@ def fit_candidate(
     initial = cylinder = hypothesis.cylinder
     for turn in range(12):
         axis = cylinder.axis
-        step = max(0.5 * cylinder.length, 0.25, 4.0 * cylinder.radius) if turn else 0.0
+        step = max(0.5 * cylinder.length, (1.0 + _BRIDGING) * _longest_gap(cylinder.radius)) if turn else 0.0
         # Hypotheses are right to a tenth of the radius; a wider reach would take in the neighbour of a rack.
         reach = 1.0 + 0.1 * cylinder.radius / wide if turn == 0 else 1.2
         rows = tree.near_segment(
@@ -352,7 +354,7 @@ def _connected_intervals(intervals: list[Interval], gap: float, radius: float) -
 
 
 def _bridged(interval: Interval, gap: float, most: float, radius: float) -> bool:
-    return gap < min(most, max(4.0 * interval.length, radius))
+    return gap < min(most, max(interval.length / _BRIDGING, radius))
 
 
 def _without_caps(cylinder: Cylinder, wide: float) -> Interval:

@@ -64,3 +64,20 @@ def test_where_both_ends_of_an_arc_lie_too_far_out_the_radius_can_be_held() -> N
         assert held.cylinder.length == pytest.approx(1.0, abs=0.02)
         # The radius is not told: the ends of the arc may lie out by 1.8 mm all along, a fifth of which is the sagitta.
         assert held.radius_sigma == pytest.approx(8.7e-3, rel=0.1)
+
+
+@pytest.mark.parametrize(("gap", "bridged"), [(5.0, True), (9.5, True), (11.0, False)])
+def test_a_pipe_is_followed_behind_what_hides_ten_radii_of_it(gap: float, bridged: bool) -> None:
+    """`gap`: between the two stretches of it that are seen, in radii. The hypothesis is of the shorter one."""
+    radius, noise = 0.0841, 3e-3
+    near, far = 2.5 * radius, 4.0 * radius
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-0.5, 0.5, 3000) * ARC
+    along = np.where(np.arange(3000) < 1000, rng.uniform(-near, 0.0, 3000), gap * radius + rng.uniform(0.0, far, 3000))
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), along], axis=1)
+    tree = octree.build(points + rng.normal(0.0, noise, points.shape))
+    start = Cylinder(np.array([0.0, 0.0, -near]), np.array([0.0, 0.0, 0.0]), 0.95 * radius)
+    found = fit_candidate(tree, np.ones(3000, bool), Hypothesis(start, 9), noise)
+    assert found is not None
+    assert found.cylinder.length == pytest.approx(near + (gap * radius + far if bridged else 0.0), abs=0.02)
+    assert found.cylinder.radius == pytest.approx(radius, abs=0.5 * noise)
