@@ -36,6 +36,7 @@ CLOSE_GATE = 0.25  # of the radius, around the centres that a verified pose pred
 PREDICTED_GATE = 0.5  # of the radius, around those of a known pose: a board that contradicts its file is still found
 MAX_AXIS_ERROR = 0.2  # of the semi-major axis, of both semi-axes against the predicted ones ...
 MIN_AXIS_ERROR = 1.5  # ... but never less than this, px: blur and exposure widen the image of a bright disc
+MAX_STARTS = 4  # triangles that a pose is started from: those of a rectangle are equally large
 MAX_START_MISFIT = 4.0  # of the three ellipses that start a pose, in units of the largest allowed after refinement
 MARGIN = 4.0  # px from the image's edge within which a circle may be missed
 
@@ -203,19 +204,18 @@ def _verify(
 ) -> BoardFit | None:
     """The refined pose and the circles it explains, or None where circles and ellipses (K,) do not form the board.
 
-    The centres of three circles give up to four poses, each of which predicts the shapes of their ellipses as well:
-    nine numbers to test it by. The best is refined, and circles that do not fit are removed one by one.
+    A pose from three circles is refined with all that it explains, and circles that do not fit are removed one by one.
     """
     matrix = camera.matrix
-    triple = list(max(combinations(range(len(circles)), 3), key=lambda rows: _area(board.centres[circles[list(rows)]])))
-    if _area(board.centres[circles[triple]]) < board.circle_radius**2:
+    fit = None
+    for start in _starts(ellipses, board, matrix, circles, members):
+        matched = _matched_circles(ellipses, free, board, matrix, start, CLOSE_GATE)
+        if fit is None or len(matched.circles) > len(fit.circles):
+            fit = matched
+        if len(fit.circles) >= len(circles):
+            break
+    if fit is None:
         return None
-    starts = three_point_poses(board.centres[circles[triple]], ellipses.centres[members[triple]], matrix)
-    fits = [BoardFit(start, circles, members) for start in starts]
-    misfits = [misfit(ellipses, board, matrix, fit)[triple].max() for fit in fits]
-    if not misfits or min(misfits) > MAX_START_MISFIT:
-        return None
-    fit = _matched_circles(ellipses, free, board, matrix, starts[int(np.argmin(misfits))], CLOSE_GATE)
     while len(fit.circles) >= MIN_CIRCLES:
         fit = refine_pose(ellipses, board, matrix, fit)
         off = misfit(ellipses, board, matrix, fit)
@@ -226,6 +226,26 @@ def _verify(
         return None
     # Of the circles that are wholly in the image more than half must be found; the others may be hidden.
     return fit if 2 * len(fit.circles) > circles_in_image(board, camera, fit.pose).sum() else None
+
+
+def _starts(
+    ellipses: ImageEllipses, board: Board, matrix: FloatArray, circles: NDArray[np.intp], members: NDArray[np.intp]
+) -> Iterator[FloatArray]:
+    """Poses (4, 4) of the board from three of its circles each, the largest triangles first; none where they misfit.
+
+    The centres of three circles give up to four poses, each of which predicts the shapes of their ellipses as well:
+    nine numbers to test it by. Of a board that faces the camera two poses are nearly one: noise may leave neither.
+    """
+    triples = sorted(combinations(range(len(circles)), 3), key=lambda rows: -_area(board.centres[circles[list(rows)]]))
+    for rows in triples[:MAX_STARTS]:
+        triple = list(rows)
+        if _area(board.centres[circles[triple]]) < board.circle_radius**2:
+            return
+        starts = three_point_poses(board.centres[circles[triple]], ellipses.centres[members[triple]], matrix)
+        misfits = [misfit(ellipses, board, matrix, BoardFit(start, circles, members))[triple].max() for start in starts]
+        if not misfits or min(misfits) > MAX_START_MISFIT:
+            return
+        yield starts[int(np.argmin(misfits))]
 
 
 def _area(corners: FloatArray) -> float:

@@ -63,6 +63,7 @@ def test_no_ellipses_in_flat_and_noisy_images():
 @settings(max_examples=15, deadline=None)
 @given(st.floats(-1.2, 1.2), st.floats(-0.7, 0.7), st.floats(1.0, 2.5), st.floats(-0.6, 0.6), st.integers(0, 2**16))
 @example(0.25, 0.0, 1.0, 0.0, 16)  # the largest triangle of circles gives no pose of the right order
+@example(0.25, 0.0, 1.25, 0.0, 1)  # that triangle gives a wrong pose, by which four circles look upside down
 @example(1.1875, 0.25, 2.0, 0.0, 2944)  # three ellipses look like the other board, two of them circles of this one
 def test_identity_from_geometry_in_clutter(x, y, z, roll, seed):
     rng = np.random.default_rng(seed)
