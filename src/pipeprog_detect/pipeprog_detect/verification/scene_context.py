@@ -84,27 +84,27 @@ class SceneContext:
             if abs(plane.normal @ cylinder.axis) < ALONG and abs(abs(away) - cylinder.radius) < allowed:
                 tangent.append((plane, np.sign(away) * plane.normal))
         corners = [
-            towards_one + towards_other
+            (one, other, towards_one + towards_other)
             for (one, towards_one), (other, towards_other) in combinations(tangent, 2)
             if abs(float(towards_one @ towards_other)) < CORNER
-            and self._runs_beside(one, other, cylinder)
-            and self._runs_beside(other, one, cylinder)
         ]
         if not corners:
             return False
         front = self._surface(candidate)[1].mean(axis=0)
-        return any(float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner) for corner in corners)
+        beside = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, _reach_beside(cylinder))]
+        return any(
+            float(front @ corner) > 0.7 * np.linalg.norm(front) * np.linalg.norm(corner)
+            and self._run_beside(cylinder, beside, one, other)
+            for one, other, corner in corners
+        )
 
-    def _runs_beside(self, plane: Plane, other: Plane, cylinder: Cylinder) -> bool:
-        """Whether points of the plane, and not of the other, lie beside more than half of the cylinder.
+    def _run_beside(self, cylinder: Cylinder, points: FloatArray, one: Plane, other: Plane) -> bool:
+        """Whether each of two planes has points (N, 3) of its own beside more than half of the cylinder.
 
         A plane is known by its normal and offset: what was seen of it may be far away.
         """
-        reach = cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE)
-        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, reach)]
-        on_plane, on_other = (np.abs(points @ each.normal - each.offset) < self.clearance for each in (plane, other))
-        share = cylinder.along(points[on_plane & ~on_other]) / cylinder.length
-        return _is_along_half(cylinder, share[(share > 0.0) & (share < 1.0)])
+        on_one, on_other = (np.abs(points @ each.normal - each.offset) < self.clearance for each in (one, other))
+        return all(_are_along_half(cylinder, points[own]) for own in (on_one & ~on_other, on_other & ~on_one))
 
     def is_embedded(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
         """Whether the cylinder, looked at along `towards` (3,), would lie within walls where these are seen beside it.
@@ -116,7 +116,7 @@ class SceneContext:
         wrong by a share of the radius, and the axis of a pipe on a wall is a whole radius before it.
         """
         sideways, depth = frame(cylinder, towards)
-        reach = cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE)
+        reach = _reach_beside(cylinder)
         rows = self.walls.near_segment(cylinder.start, cylinder.end, _ASLANT * reach)
         offset = self.walls.points[rows] - cylinder.start
         aside, behind = offset @ sideways, offset @ depth
@@ -140,16 +140,13 @@ class SceneContext:
         """
         nearest = cylinder.radius + self.clearance
         points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, nearest + _LEAST_BESIDE)]
-        along = cylinder.along(points)
-        within = (along > 0.0) & (along < cylinder.length)
-        points, along = points[within], along[within]
-        foot = cylinder.at(along / cylinder.length)
+        foot = cylinder.at(cylinder.along(points) / cylinder.length)
         touching = np.linalg.norm(points - foot, axis=1) < nearest
         for plane in self.planes:
             if abs(plane.normal @ cylinder.axis) < ALONG:
                 from_points, from_axis = (np.abs(each @ plane.normal - plane.offset) for each in (points, foot))
                 touching |= (from_points < self.clearance) & (from_axis < nearest)
-        return _is_along_half(cylinder, along[touching] / cylinder.length)
+        return _are_along_half(cylinder, points[touching])
 
     @property
     def clearance(self) -> float:
@@ -170,7 +167,14 @@ class SceneContext:
         return rows[near], radial[near] / (distance[near] + 1e-12)[:, None]
 
 
-def _is_along_half(cylinder: Cylinder, share: FloatArray) -> bool:
-    """Whether points at these shares (N,) of its length, 0 to 1, lie along more than half of a cylinder."""
+def _reach_beside(cylinder: Cylinder) -> float:
+    """How far from the axis [m] of a cylinder walls are looked at beside it."""
+    return float(cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE))
+
+
+def _are_along_half(cylinder: Cylinder, points: FloatArray) -> bool:
+    """Whether points (N, 3) lie along more than half of a cylinder."""
+    along = cylinder.along(points)
+    within = along[(along > 0.0) & (along < cylinder.length)]
     steps = max(int(cylinder.length / _STEP), 4)
-    return len(np.unique((share * steps).astype(np.int64))) > 0.5 * steps
+    return len(np.unique((within / cylinder.length * steps).astype(np.int64))) > 0.5 * steps

@@ -231,18 +231,18 @@ def _verify(
 def _starts(
     ellipses: ImageEllipses, board: Board, matrix: FloatArray, circles: NDArray[np.intp], members: NDArray[np.intp]
 ) -> Iterator[FloatArray]:
-    """Poses (4, 4) of the board from three of its circles each, the largest triangles first; none where they misfit.
+    """Poses (4, 4) of the board from three of its circles each, the largest triangles first, up to one that misfits.
 
     The centres of three circles give up to four poses, each of which predicts the shapes of their ellipses as well:
     nine numbers to test it by. Of a board that faces the camera two poses are nearly one: noise may leave neither.
     """
     triples = sorted(combinations(range(len(circles)), 3), key=lambda rows: -_area(board.centres[circles[list(rows)]]))
     for rows in triples[:MAX_STARTS]:
-        triple = list(rows)
-        if _area(board.centres[circles[triple]]) < board.circle_radius**2:
+        three, their = circles[list(rows)], members[list(rows)]
+        if _area(board.centres[three]) < board.circle_radius**2:
             return
-        starts = three_point_poses(board.centres[circles[triple]], ellipses.centres[members[triple]], matrix)
-        misfits = [misfit(ellipses, board, matrix, BoardFit(start, circles, members))[triple].max() for start in starts]
+        starts = three_point_poses(board.centres[three], ellipses.centres[their], matrix)
+        misfits = [misfit(ellipses, board, matrix, BoardFit(start, three, their)).max() for start in starts]
         if not misfits or min(misfits) > MAX_START_MISFIT:
             return
         yield starts[int(np.argmin(misfits))]
