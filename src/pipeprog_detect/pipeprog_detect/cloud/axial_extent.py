@@ -54,6 +54,8 @@ _BRIDGED = 3
 _BEND_SLICES = 2
 # A long-radius elbow turns about 1.5 diameters, 3 radii: at s beyond its beginning the centre is s^2 / (2 * 3 r) off.
 _ELBOW_RADII = 3.0
+# Gap between pieces of one pipe: ten radii or 0.3 m are what fittings, clamps and occluders hide.
+_GAP_RADII, _GAP = 10.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,11 @@ class Interval:
 def bin_length(radius: float, points_per_metre: float) -> float:
     """Length [m] of a bin along the axis of a pipe with this radius [m] and these points for each metre."""
     return float(np.clip(_POINTS_PER_BIN / max(points_per_metre, 1.0), _SHORTEST_BIN, max(radius, _LONGEST_BIN)))
+
+
+def longest_gap(radius: float) -> float:
+    """Gap [m] between stretches of surface of a pipe of this radius [m] that a fitting or an occluder explains."""
+    return max(_GAP_RADII * radius, _GAP)
 
 
 def surface_intervals(points: FloatArray, cylinder: Cylinder) -> list[Interval]:

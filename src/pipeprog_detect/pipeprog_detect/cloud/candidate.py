@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.axial_extent import Interval, straight_interval, surface_intervals
+from pipeprog_detect.cloud.axial_extent import Interval, longest_gap, straight_interval, surface_intervals
 from pipeprog_detect.cloud.axis_voting import Hypothesis, Sector
 from pipeprog_detect.cloud.cylinder_fit import CylinderFit, basis, covered_arc, fit_cylinder, quick_fit
 from pipeprog_detect.cloud.octree import Octree
@@ -111,7 +111,7 @@ def fit_candidate(
     initial = cylinder = hypothesis.cylinder
     for turn in range(12):
         axis = cylinder.axis
-        step = max(0.5 * cylinder.length, (1.0 + _BRIDGING) * _longest_gap(cylinder.radius)) if turn else 0.0
+        step = max(0.5 * cylinder.length, (1.0 + _BRIDGING) * longest_gap(cylinder.radius)) if turn else 0.0
         # Hypotheses are right to a tenth of the radius; a wider reach would take in the neighbour of a rack.
         reach = 1.0 + 0.1 * cylinder.radius / wide if turn == 0 else 1.2
         rows = tree.near_segment(
@@ -321,7 +321,7 @@ def _visible_intervals(points: FloatArray, cylinder: Cylinder, wide: float) -> l
         return []
     return _connected_intervals(
         surface_intervals(_between(points[skin], cylinder, straight), cylinder),
-        _longest_gap(cylinder.radius),
+        longest_gap(cylinder.radius),
         cylinder.radius,
     )
 
@@ -331,11 +331,6 @@ def _covered_intervals(points: FloatArray, cylinder: Cylinder, wide: float) -> l
     skin = points[np.abs(_signed_distance(points, cylinder)) < 3.0 * wide]
     intervals = surface_intervals(_between(skin, cylinder, Interval(0.0, cylinder.length)), cylinder)
     return [interval for interval in intervals if interval.length > max(0.5 * cylinder.radius, _LEAST_PIECE)]
-
-
-def _longest_gap(radius: float) -> float:
-    """Gap [m] in the surface that a clamp, a flange or an occluder explains."""
-    return max(10.0 * radius, 0.3)
 
 
 def _connected_intervals(intervals: list[Interval], gap: float, radius: float) -> list[Interval]:

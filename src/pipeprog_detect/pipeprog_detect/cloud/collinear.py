@@ -10,6 +10,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud.axial_extent import longest_gap
 from pipeprog_detect.types import Cylinder
 
 # Pieces of one pipe: axes within 2 deg, or half a radius over the length of the shorter piece, as well as its direction
@@ -20,9 +21,7 @@ _ANGLE_RADII = 0.5
 _OFFSET = 0.25
 _RATIO = 1.12
 _LEAST_OFFSET = 4e-3
-# Gap between pieces of one pipe: ten radii or 0.3 m are what fittings, clamps and occluders hide. Where the offset is
-# within half of what is allowed, it may be as long as the shorter piece, or 15 radii.
-_GAP_RADII, _GAP = 10.0, 0.3
+# Where the offset is within half of what is allowed, a gap may be as long as the shorter piece, or 15 radii.
 _CLOSE = 0.5
 _CLOSE_GAP_RADII = 15.0
 # The middle of an elbow: at most 6 radii long (the arc of a long-radius elbow, 3 radii times 90 deg, is 4.7), beside a
@@ -101,7 +100,7 @@ def _one_pipe(one: Cylinder, other: Cylinder) -> bool:
     if offset > _OFFSET * radius + _LEAST_OFFSET:
         return False
     close = offset < _CLOSE * _OFFSET * radius + _LEAST_OFFSET
-    allowed = max(_GAP_RADII * radius, _GAP)
+    allowed = longest_gap(radius)
     return gap < (max(allowed, shorter.length, _CLOSE_GAP_RADII * radius) if close else allowed)
 
 
