@@ -284,6 +284,18 @@ def _weigh(
 
 
 @njit(cache=True, nogil=True)
+def _middle_row(row: float, width: int) -> float:
+    """The row in the middle between the edges of a line that `_lines` gives; `width`: in half rows."""
+    return row + 0.5 * (width % 2)
+
+
+@njit(cache=True, nogil=True)
+def _inverse_step(angle: float) -> float:
+    """Step of inverse depth [1/m] that moves a line by STEP_ROWS in a view BASELINE away; `angle` of a row [rad]."""
+    return STEP_ROWS * angle / BASELINE
+
+
+@njit(cache=True, nogil=True)
 def _distances(
     line: FloatArray, place: FloatArray, size: IntArray, reach: NDArray[np.float32], radius: float
 ) -> FloatArray:
@@ -293,12 +305,12 @@ def _distances(
     """
     first, last, width = int(line[2]), int(line[3]), int(line[4])
     inside = min(max(first, 0), size[1] - 1)
-    seen = reach[_block_of(line[1] + 0.5 * (width % 2), size[0]), inside : max(last, inside) + 1]
+    seen = reach[_block_of(_middle_row(line[1], width), size[0]), inside : max(last, inside) + 1]
     near = (0.5 * width + WIDER) * place[4] / radius  # inverse distances
     far = max(max(0.5 * width - WIDER, 0.5) * place[4] / radius, 1.0 / (seen.max() + BEFORE))
     if far >= near:
         return np.empty(0)
-    return 1.0 / np.linspace(far, near, int((near - far) / (STEP_ROWS * place[4] / BASELINE)) + 2)
+    return 1.0 / np.linspace(far, near, int((near - far) / _inverse_step(place[4])) + 2)
 
 
 @njit(cache=True, nogil=True)
@@ -334,7 +346,7 @@ def _at_best_depth(
     for k in range(len(lines)):
         v, first, last = int(lines[k, 0]), int(lines[k, 2]), int(lines[k, 3])
         distances = _distances(lines[k], place[v], size[v], reach[v], radius)
-        angle = place[v, 3] + (lines[k, 1] + 0.5 * (int(lines[k, 4]) % 2) - place[v, 7]) * place[v, 4]
+        angle = place[v, 3] + (_middle_row(lines[k, 1], int(lines[k, 4])) - place[v, 7]) * place[v, 4]
         across, up = np.cos(angle), np.sin(angle)
         least, most = (first + place[v, 5]) * place[v, 6], (last + 1.0 + place[v, 5]) * place[v, 6]
         count = max((last + 1 - first) // COLUMNS, 3)
@@ -350,7 +362,7 @@ def _at_best_depth(
         away = distances[scores.argmax()]
         likely = distances[scores > scores.max() - DECISIVE]
         # Half of the range is two standard deviations; the next step might be as good.
-        sigma = 0.25 * (likely.max() - likely.min()) + 0.5 * STEP_ROWS * place[v, 4] / BASELINE * away**2
+        sigma = 0.25 * (likely.max() - likely.min()) + 0.5 * _inverse_step(place[v, 4]) * away**2
         x, y = place[v, 0] + away * across, place[v, 1] + away * up
         low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
         at = (x, y, low, STRETCH)
