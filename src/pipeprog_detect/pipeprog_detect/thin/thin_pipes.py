@@ -4,53 +4,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.acceptance import VAGUEST
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities
-from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.scene import Scene, viewing_direction
-from pipeprog_detect.thin.axis_sweep import Proposal, propose_parallel
+from pipeprog_detect.thin.axis_sweep import propose_parallel
 from pipeprog_detect.thin.corners import is_corner
-from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, covers, mean_centre
+from pipeprog_detect.thin.depth_from_cloud import covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_false_line
-from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA, propose
+from pipeprog_detect.thin.line_fitter import LineFitter, turned
+from pipeprog_detect.thin.line_triangulation import propose
 from pipeprog_detect.thin.pair_views import pair_views
 from pipeprog_detect.thin.parallel_directions import (
-    LEAST_PARALLEL,
     NEARLY_PARALLEL,
     PARALLEL_SIGMA,
     parallel_directions,
 )
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.candidate_fit import CONVINCING, MANUFACTURE, REACH
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 from pipeprog_detect.verification.scene_context import SceneContext
 
 # Proposals that are measured, and points of the cloud that bound their depths: a computing budget. More proposals than
 # a site has thin pipes cost time only.
 MOST_PROPOSED, MOST_POINTS = 40, 600_000
-# Without support by the cloud, this support of the contour is required, and half of it on each side separately: the
-# edge of a duct, whose faces differ in brightness, is one side, with texture for the other.
-LINES_CONVINCING = (0.6, 0.3)
-# What runs parallel to known pipes has other evidence beside its contour, as a candidate of the cloud has.
-PARALLEL_CONVINCING = (CONVINCING, 0.5 * CONVINCING)
-# Standard deviation of the distance of a pipe found by its lines [m]: its width tells a twentieth, the cloud more.
-LINE_DEPTH_SIGMA = 0.03
 # The axes of pipes side by side are at least two radii apart.
 TOUCHING = 2.0
 # Their axes are known to this [m].
 AXIS_SIGMA = 1e-3
-# Standard deviation of a slope to which a fit is held [rad]: a tenth of that of parallel pipes, so that the search
-# keeps to it. From its middle the ends of six metres are then 2 mm aside: its axis is known to this [m].
-DIRECTION_HELD, HELD_AXIS = 0.1 * PARALLEL_SIGMA, 2e-3
 
 
 def find_thin_pipes(
@@ -79,7 +64,7 @@ def find_thin_pipes(
     radii = [radius for radius in boq.radii if radius < thickest]
     if not views or not radii:
         return []
-    lines = _LineFitter(views, points.astype(np.float32, copy=False), radii, boq)
+    lines = LineFitter(views, points.astype(np.float32, copy=False), radii, boq)
     some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
     thin: list[MeasuredPipe] = []
@@ -142,7 +127,7 @@ def turned_parallel(
     radii = [radius for radius in boq.radii if radius < thickest]
     if not views or not radii:
         return list(measured)
-    lines = _LineFitter(views, points.astype(np.float32, copy=False), radii, boq)
+    lines = LineFitter(views, points.astype(np.float32, copy=False), radii, boq)
     cylinders = [each.cylinder for each in measured]
     turned_ones = list(measured)
     for number, each in enumerate(measured):
@@ -175,144 +160,6 @@ def is_shadow(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
         and float(other.surface_distance(middle)[0]) < cylinder.radius - AXIS_SIGMA
         for other in known
     )
-
-
-@dataclass(frozen=True)
-class _LineFitter:
-    """Fits proposals in the views; with the cloud's points (N, 3) and the radii [m] of thin pipes."""
-
-    views: Sequence[View]
-    points: NDArray[np.float32]
-    radii: Sequence[float]
-    boq: BillOfQuantities
-
-    def along_known_pipes(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
-        """The whole of a pipe of which the direction is known; None where its contour is not seen.
-
-        Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
-        away looks the same, from where the cloud has it, too, and the most probable fit counts.
-        """
-        start, depth_sigma = proposal.cylinder, proposal.depth_sigma
-        if depth_sigma <= DEPTH_SIGMA * start.radius:
-            return self._parallel(start, depth_sigma, known)
-        centre = mean_centre(start, self.views)
-        at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, False)
-        rough = [(start, min(depth_sigma, DEPTH_REACH))] + ([] if at_depth is None else [(at_depth, LINE_DEPTH_SIGMA)])
-        starts = [Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True) for each, sigma in rough]
-        located = [refine(each, self.views, known, self.radii) for each in starts]
-        # The known direction is evidence once: the fit has drawn the axis from it as far as the views did.
-        again = [
-            turned(replace(fit.cylinder, radius=start.radius), start.axis, self.views)
-            for fit in located
-            if fit is not None
-        ]
-        fits = [self._parallel(each, LINE_DEPTH_SIGMA, known) for each in again]
-        return max((fit for fit in fits if fit is not None), key=lambda fit: fit.log_odds, default=None)
-
-    def _parallel(self, start: Cylinder, depth_sigma: float, known: Sequence[Cylinder]) -> ContourFit | None:
-        """The accepted fit of a pipe that is parallel to known ones.
-
-        A shadow along it is taken for one of its sides where no planned radius results: then its own one is held.
-        """
-        starts = [
-            Start(start, start.radius, True, depth_sigma, PARALLEL_SIGMA, radius_fixed=fixed) for fixed in (False, True)
-        ]
-        fits = [refine(each, self.views, known, self.radii) for each in starts]
-        seen = [fit for fit in fits if fit is not None]
-        good = (fit for fit in seen if self._accepts(fit, known, PARALLEL_CONVINCING))
-        return next(good, None)
-
-    def in_direction(self, start: Cylinder, known: Sequence[Cylinder]) -> list[ContourFit]:
-        """The accepted fits of a whole pipe: in the direction of `start`, and, from there, near this direction."""
-        held = refine(Start(start, start.radius, True, LINE_DEPTH_SIGMA, DIRECTION_HELD), self.views, known, self.radii)
-        if held is None:
-            return []
-        near = refine(Start(held.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA), self.views, known, self.radii)
-        fits = [held] if near is None else [held, near]
-        return [fit for fit in fits if self._accepts(fit, known, PARALLEL_CONVINCING)]
-
-    def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
-        """The whole of a pipe of the given radius [m] of which a piece was found.
-
-        Its depth, which lines seen from one height leave open, is that of the cloud's points before the wall.
-        """
-        slope_known_to = float(np.sqrt(piece.covariance[3, 3]))
-        start, slope_sigma = aligned(replace(piece.cylinder, radius=radius), known, self.views, slope_known_to)
-        centre = mean_centre(start, self.views)
-        at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, not np.isfinite(slope_sigma))
-        depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * radius
-        return self.measure(at_depth or start, known, depth_sigma, slope_sigma)
-
-    def measure(
-        self,
-        proposed: Cylinder,
-        known: Sequence[Cylinder],
-        depth_sigma: float = LINE_DEPTH_SIGMA,
-        slope_sigma: float = np.inf,
-        follow: bool = True,
-    ) -> ContourFit | None:
-        """The fit where it has the contour of a pipe and a planned radius; None otherwise."""
-        start = Start(proposed, proposed.radius, True, depth_sigma, slope_sigma)
-        fit = refine(start, self.views, known, self.radii, follow)
-        return fit if fit is not None and self._accepts(fit, known, LINES_CONVINCING) else None
-
-    def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], least: tuple[float, float]) -> bool:
-        """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does.
-
-        Its radius is what tells it from the rods of hangers: it keeps to the planned one within three sigma.
-
-        `least`: support required of the contour, and of each of its sides by edges that are no known pipe's.
-        """
-        return (
-            fit.support >= least[0]
-            and fit.radius_sigma < VAGUEST * fit.cylinder.radius
-            and is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
-            and any(
-                abs(fit.cylinder.radius - planned) < np.hypot(REACH * fit.radius_sigma, MANUFACTURE * planned)
-                for planned in self.radii
-            )
-            and Scene.of(fit.cylinder, self.views, known).own_support().weaker_share >= least[1]
-            and not fit.is_flat
-        )
-
-
-def aligned(
-    proposed: Cylinder, known: Sequence[Cylinder], views: Sequence[View], slope_known_to: float
-) -> tuple[Cylinder, float]:
-    """The cylinder turned parallel to the known ones of nearly its direction, and their standard deviation [rad].
-
-    Its image stays. Seen from one height alone, a level pipe may as well slope towards the cameras: known pipes tell
-    the slope, if they differ from it by less than three of its standard deviations, `slope_known_to` [rad]. With fewer
-    than `LEAST_PARALLEL` of them the cylinder is returned as it is, with infinity.
-    """
-    across = _sideways(proposed, views)
-    towards = np.cross(across, proposed.axis)
-    axes = np.array([other.axis * np.sign(other.axis @ proposed.axis) for other in known]).reshape(-1, 3)
-    steepest = max(np.tan(NEARLY_PARALLEL), 3.0 * slope_known_to)
-    slope = np.abs(axes @ towards) / (axes @ proposed.axis)
-    axes = axes[(np.abs(axes @ across) < np.sin(NEARLY_PARALLEL)) & (slope < steepest)]
-    if len(axes) < LEAST_PARALLEL:
-        return proposed, np.inf
-    direction = np.median(axes, axis=0)
-    spread = float(np.median(np.linalg.norm(axes - direction, axis=1)))
-    return turned(proposed, direction, views), max(spread, PARALLEL_SIGMA)
-
-
-def turned(cylinder: Cylinder, direction: FloatArray, views: Sequence[View]) -> Cylinder:
-    """The cylinder turned towards the cameras or away from them until it runs along `direction` (3,); its image stays.
-
-    Its middle and its length stay as well.
-    """
-    across = _sideways(cylinder, views)
-    along = direction - (direction @ across) * across
-    half = 0.5 * cylinder.length * along / np.linalg.norm(along)
-    return Cylinder(cylinder.middle - half, cylinder.middle + half, cylinder.radius)
-
-
-def _sideways(cylinder: Cylinder, views: Sequence[View]) -> FloatArray:
-    """Unit vector (3,) across the axis and across the lines of sight to it."""
-    across = np.cross(cylinder.axis, viewing_direction(cylinder, views))
-    return np.asarray(across / np.linalg.norm(across), np.float64)
 
 
 def _as_candidate(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:

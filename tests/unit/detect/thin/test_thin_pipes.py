@@ -12,14 +12,9 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.thin.thin_pipes import (
-    NEARLY_PARALLEL,
-    _LineFitter,
-    aligned,
-    is_shadow,
-    turned,
-    turned_parallel,
-)
+from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned
+from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL
+from pipeprog_detect.thin.thin_pipes import is_shadow, turned_parallel
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from tests.unit.detect.straight_ahead import looking_along_y
@@ -67,11 +62,11 @@ def test_a_thin_pipe_is_turned_parallel_to_others_where_that_is_more_probable(
     """Its contour as measured has odds of 100 (logarithm), and of `log_odds` where it is parallel to the others."""
     started = []
 
-    def fits(self: _LineFitter, start: Cylinder, known: list[Cylinder]) -> list[ContourFit]:
+    def fits(self: LineFitter, start: Cylinder, known: list[Cylinder]) -> list[ContourFit]:
         started.append(start)
         return [each.fit for odds in (80.0, log_odds) if (each := measured(start, odds)).fit is not None]
 
-    monkeypatch.setattr(_LineFitter, "in_direction", fits)
+    monkeypatch.setattr(LineFitter, "in_direction", fits)
     boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     views: list[View] = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     beside = [measured(Cylinder(each.start, each.end, 0.05), 100.0) for each in (level(1.0), level(2.0), level(3.0))]
@@ -122,7 +117,7 @@ def test_a_rod_of_another_size_is_no_thin_pipe(sigmas: float, stands: bool) -> N
     views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     rod = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned + sigmas * sigma)
     fit = ContourFit(rod, np.eye(3)[1:], np.eye(5), sigma, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
-    lines = _LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
+    lines = LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
     assert lines._accepts(fit, [], (0.6, 0.0)) is stands
 
 
@@ -134,5 +129,5 @@ def test_what_may_have_any_radius_is_no_thin_pipe(share: float, stands: bool) ->
     views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     line = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned)
     fit = ContourFit(line, np.eye(3)[1:], np.eye(5), share * planned, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
-    lines = _LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
+    lines = LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
     assert lines._accepts(fit, [], (0.6, 0.0)) is stands
