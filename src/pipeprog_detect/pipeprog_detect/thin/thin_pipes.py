@@ -20,11 +20,7 @@ from pipeprog_detect.thin.false_lines import is_false_line
 from pipeprog_detect.thin.line_fitter import LineFitter, turned
 from pipeprog_detect.thin.line_triangulation import propose
 from pipeprog_detect.thin.pair_views import pair_views
-from pipeprog_detect.thin.parallel_directions import (
-    NEARLY_PARALLEL,
-    PARALLEL_SIGMA,
-    parallel_directions,
-)
+from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL, PARALLEL_SIGMA, parallel_directions
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 from pipeprog_detect.verification.scene_context import SceneContext

@@ -1,48 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs parallel beside a pipe that was found by its lines tells its slope."""
+"""Thin pipes are parallel to others where that is more probable, and never lie within another pipe."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 
-from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned
-from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL
+from pipeprog_detect.thin.line_fitter import LineFitter
 from pipeprog_detect.thin.thin_pipes import is_shadow, turned_parallel
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
-from tests.unit.detect.straight_ahead import looking_along_y
-
-
-def level(length: float, slope: float = 0.0, turn: float = 0.0) -> Cylinder:
-    """A cylinder along x whose end lies `slope` [rad] towards the cameras and `turn` [rad] higher."""
-    axis = np.array([1.0, -np.tan(slope), np.tan(turn)])
-    half: FloatArray = 0.5 * length * axis / np.linalg.norm(axis)
-    return Cylinder(-half, half, 0.0086)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.floats(-0.2, 0.2), st.floats(0.005, 0.08))
-def test_a_slope_that_may_be_wrong_is_that_of_the_pipes_beside(slope: float, known_to: float) -> None:
-    """Up to three standard deviations of the proposal's own slope, at least 5 degrees; seen from ahead it stays."""
-    steepest = max(np.tan(NEARLY_PARALLEL), 3.0 * known_to)
-    assume(abs(abs(np.tan(slope)) - steepest) > 1e-9)  # rounding
-    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
-    beside = [level(length) for length in (1.0, 2.0, 3.0)]
-    proposed = level(0.7, slope)
-    found, sigma = aligned(proposed, beside, views, known_to)
-    if abs(np.tan(slope)) < steepest:
-        assert np.isfinite(sigma)
-        assert abs(found.axis @ beside[0].axis) > np.cos(1e-6)
-    else:
-        assert not np.isfinite(sigma)
-        assert found == proposed
+from tests.unit.detect.straight_ahead import level, looking_along_y
 
 
 def measured(cylinder: Cylinder, log_odds: float) -> MeasuredPipe:
@@ -79,55 +50,9 @@ def test_a_thin_pipe_is_turned_parallel_to_others_where_that_is_more_probable(
         assert abs(float(after.cylinder.axis @ level(1.0).axis)) > np.cos(1e-6)
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_a_turned_pipe_keeps_its_image(slope: float, turn: float, to: float) -> None:
-    """It is turned in the plane of the lines of sight; what the direction has beside that plane is left out."""
-    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
-    before = level(0.7, slope, turn)
-    after = turned(before, level(1.0, to, 0.1).axis, views)
-    across = np.cross(before.axis, [0.0, 1.0, 0.0])
-    assert abs(after.axis @ across) < 1e-9
-    assert np.allclose(after.middle, before.middle)
-    assert after.length == pytest.approx(before.length)
-    same = turned(before, before.axis, views)
-    assert np.allclose(same.axis, before.axis)
-
-
-def test_what_runs_in_another_direction_in_the_image_is_not_parallel() -> None:
-    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
-    beside = [level(length, turn=np.radians(8.0)) for length in (1.0, 2.0, 3.0)]
-    assert not np.isfinite(aligned(level(0.7), beside, views, 0.1)[1])
-    assert not np.isfinite(aligned(level(0.7), [*beside[:2], level(1.0)], views, 0.1)[1])
-
-
 @pytest.mark.parametrize(("apart", "shadow"), [(0.012, True), (0.0155, True), (0.0175, False), (0.04, False)])
 def test_two_pipes_cannot_lie_within_each_other(apart: float, shadow: bool) -> None:
     beside = level(0.35).shifted(np.array([0.1, 0.0, apart]))
     assert is_shadow(beside, [level(1.6)]) is shadow
     assert not is_shadow(beside.shifted(np.array([1.0, 0.0, 0.0])), [level(1.6)])  # beyond its end
     assert not is_shadow(level(0.35, turn=np.radians(30.0)).shifted(np.array([0.0, 0.01, 0.0])), [level(1.6)])
-
-
-@pytest.mark.parametrize(("sigmas", "stands"), [(1.7, True), (2.9, True), (3.3, False)])
-def test_a_rod_of_another_size_is_no_thin_pipe(sigmas: float, stands: bool) -> None:
-    """The bracket of a clamp, 18 mm square, has two edges as a pipe of 17.2 mm has."""
-    planned, sigma = 0.0086, 1.76e-4
-    boq = BillOfQuantities((PipeClass("copper 17", planned, 10.0, (1.0, 0.0, 1.0), 4e-4),))
-    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
-    rod = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned + sigmas * sigma)
-    fit = ContourFit(rod, np.eye(3)[1:], np.eye(5), sigma, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
-    lines = LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
-    assert lines._accepts(fit, [], (0.6, 0.0)) is stands
-
-
-@pytest.mark.parametrize(("share", "stands"), [(0.05, True), (0.15, True), (0.17, False), (0.7, False)])
-def test_what_may_have_any_radius_is_no_thin_pipe(share: float, stands: bool) -> None:
-    """Half of the radii with that standard deviation lie nearer to another standard size than to the true one."""
-    planned = 0.0086
-    boq = BillOfQuantities((PipeClass("copper 17", planned, 10.0, (1.0, 0.0, 1.0), 4e-4),))
-    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
-    line = Cylinder(np.zeros(3), np.array([0.5, 0.0, 0.0]), planned)
-    fit = ContourFit(line, np.eye(3)[1:], np.eye(5), share * planned, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
-    lines = LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
-    assert lines._accepts(fit, [], (0.6, 0.0)) is stands
