@@ -43,8 +43,9 @@ SAME_AXIS, ASIDE = 18.5, 0.5
 WITH_BEND = 8.0
 # Support of a stub of which half is straight, with what the first third of the bend adds, which is nearly straight.
 HALF_SEEN = 0.7
-# Rounds in which a stub is cut to where its contour is seen.
-CUTS = 3
+# Rounds in which a stub is cut to where its contour is seen, and the least length of what is left, in radii: a shorter
+# piece tells its axis no better than its radius, and one position of the contour may show edges by chance.
+CUTS, LEAST_STUB = 3, 2.0
 # With less than this share of the former support it is not extended at all: there is something else.
 LOST = 0.5
 
@@ -87,6 +88,8 @@ def without_bend(known: AdjustedCylinder, start: Cylinder, prior: FloatArray) ->
         if cylinder.length > WITH_BEND * cylinder.radius or known.share > HALF_SEEN:
             break
         scene = replace(known.scene, cylinder=_where_seen(known))
+        if scene.cylinder.length < LEAST_STUB * cylinder.radius:
+            break
         shorter = adjusted(scene, prior, _step_from(start, scene))
         if shorter is None or shorter.share <= known.share:
             break

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray, IntArray
+from pipeprog_detect.silhouette import extension
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.axial_evidence import BRIGHTER, DARKER, NO_EDGE, _log_odds, axial_evidence
+from pipeprog_detect.silhouette.contour_adjustment import adjusted
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.edge_support import support_profile
-from pipeprog_detect.silhouette.extension import extended
+from pipeprog_detect.silhouette.extension import extended, without_bend
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -49,6 +51,18 @@ def test_a_cylinder_too_short_for_a_direction_is_extended_along_the_edges_ahead(
     fit = refine(Start(Cylinder(low, low + length * PIPE.axis, PIPE.radius), 0.002), views, [])
     assert fit is not None
     assert fit.cylinder.length == pytest.approx(PIPE.length, abs=2.0 * END_TOLERANCE)
+
+
+@pytest.mark.parametrize("seen", [0.05, 0.1])
+def test_a_stub_is_not_cut_to_less_than_its_width(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, seen: float
+) -> None:
+    """Of a contour of little contrast one position alone may show edges more often than texture does."""
+    stub = adjusted(Scene.of(PIPE.cut(0.1, 0.3), pipe_views, []), np.eye(5), np.zeros(5))
+    assert stub is not None
+    monkeypatch.setattr(extension, "_where_seen", lambda _: PIPE.cut(0.2, 0.2 + seen))
+    cut = without_bend(replace(stub, share=0.4), PIPE.cut(0.1, 0.3), np.eye(5))
+    assert cut.cylinder.length == pytest.approx(seen if seen > 2.0 * PIPE.radius else 0.2, abs=1e-5)
 
 
 def test_a_whole_pipe_and_one_that_is_not_there_do_not_grow(pipe_views: list[View], empty_views: list[View]) -> None:
