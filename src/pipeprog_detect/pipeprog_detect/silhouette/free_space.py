@@ -28,14 +28,31 @@ SPACING = 6
 SHORTEST = 0.03
 
 
-def free_stretches(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> list[tuple[float, float]]:
+def free_stretches(
+    cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder], known: Cylinder | None = None
+) -> list[tuple[float, float]]:
     """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
+
+    A stretch whose contour is seen is a hole in the cloud of the pipe's face, unless the views see through less of the
+    `known` part than that: then the contour is that of something in line with the pipe.
 
     Args:
         cylinder: whose axis is looked at, and whose contour decides where stereo has holes.
         views: the keyframes, with the depths of the nearest surfaces (`with_depths`).
         others: further cylinders, which may hide it.
+        known: the pipe before which the cylinder lies, where so much of it is known that it tells of its holes.
     """
+    stretches = _seen_through(cylinder, views, others)
+    holes = np.inf if known is None or not stretches else sum(b - a for a, b in _seen_through(known, views, others))
+    return [
+        (first, last)
+        for first, last in stretches
+        if last - first > max(holes, SHORTEST) or not _shows_a_contour(cylinder.cut(first, last), views, others)
+    ]
+
+
+def _seen_through(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> list[tuple[float, float]]:
+    """Stretches (from, to) [m from the start] of the axis behind which most views see a surface."""
     count = max(int(np.ceil(cylinder.length / STEP)), 2)
     along = (np.arange(count) + 0.5) * cylinder.length / count
     points = cylinder.start + along[:, None] * cylinder.axis
@@ -50,11 +67,7 @@ def free_stretches(cylinder: Cylinder, views: Sequence[View], others: Sequence[C
     edges = np.flatnonzero(np.diff(np.r_[False, free, False].astype(np.int8)))
     step = cylinder.length / count
     stretches = [(float(first * step), float(last * step)) for first, last in edges.reshape(-1, 2)]
-    return [
-        (first, last)
-        for first, last in stretches
-        if last - first > SHORTEST and not _shows_a_contour(cylinder.cut(first, last), views, others)
-    ]
+    return [(first, last) for first, last in stretches if last - first > SHORTEST]
 
 
 def _shows_a_contour(stretch: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:

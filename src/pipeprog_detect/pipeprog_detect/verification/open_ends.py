@@ -128,5 +128,5 @@ def _clear(
         ahead = float(place[int(np.argmax(ended))])
     if ahead < LEAST:
         return 0.0
-    free = free_stretches(Cylinder(end, end + ahead * out, cylinder.radius), views, others)
+    free = free_stretches(Cylinder(end, end + ahead * out, cylinder.radius), views, others, known=cylinder)
     return min([ahead, *(first for first, _ in free)])
