@@ -17,6 +17,7 @@ from pipeprog_detect.silhouette.one_sided import SeenArc, with_radius
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question
+from pipeprog_detect.verification.radius_agreement import is_resolved
 
 # Support that makes a pipe: those that exist show edges along more than half of their visible contour.
 CONVINCING = 0.5
@@ -130,10 +131,11 @@ class CandidateFitter:
 
         None where the cloud allows none, or where the keyframes do not tell it from the next planned one. The surface
         that the cloud shows and the side that is seen tell the radius together.
-        Where the cloud resolves the section any support that makes a fit suffices. Where the radius was given to the
-        cloud, more than half of the contour must be supported, where the surface allows it.
+        Where the cloud resolves the section any support that makes a fit suffices. Where it does not, or the radius
+        was given to it, more than half of the contour must be supported, where the surface allows it.
         """
         radius, sigma = candidate.cylinder.radius, candidate.arc_sigma
+        told_by_cloud = is_resolved(candidate) and not candidate.radius_held
         ranked = []
         for planned in self._radii():
             misfit = (planned - radius) / sigma
@@ -142,7 +144,7 @@ class CandidateFitter:
                 fit = _of_one_side(candidate, surface, views, others)
                 if fit is not None:
                     moved = float(np.linalg.norm(surface.from_axis(fit.cylinder.middle[None]))) / _sigma(candidate)
-                    if candidate.radius_held and not (moved < REACH and fit.support > CONVINCING):
+                    if not told_by_cloud and not (moved < REACH and fit.support > CONVINCING):
                         continue
                     ranked.append((fit.log_odds - 0.5 * (misfit**2 + moved**2), fit))
         ranked.sort(key=lambda entry: -entry[0])

@@ -115,6 +115,23 @@ def test_the_radius_that_one_side_does_not_tell_is_the_one_that_the_cloud_allows
     assert measured.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
 
 
+@pytest.mark.parametrize(("arc", "support", "stands"), [(115.0, 0.6, True), (115.0, 0.4, False), (125.0, 0.4, True)])
+def test_of_a_pipe_in_a_rack_one_side_suffices(
+    monkeypatch: pytest.MonkeyPatch, arc: float, support: float, stands: bool
+) -> None:
+    """Its other side is hidden, and the cloud has it 6 mm too thick: along 115 deg it may be the edge of a box."""
+    evidence = CloudEvidence(np.radians(arc), 0.98, 0.0, 0.0027, 0.0, 11.0)
+    rough = Candidate(replace(PIPE, radius=0.0634), 0.00275, 30_000, evidence)
+    fit = ContourFit(
+        replace(PIPE, radius=0.0575), np.eye(3)[1:], np.eye(5), 2e-4, support, 90.0, 20, (0.0, 0.0), 0.0, 0.5
+    )
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: None)
+    monkeypatch.setattr(candidate_fit, "_of_one_side", lambda *_: fit)
+    monkeypatch.setattr(candidate_fit, "_with_surface", lambda *_: fit.cylinder)
+    verifier = KeyframeVerifier([looking_along_y(0.0, 0)], _boq(0.0575))
+    assert [each.cylinder for each in verifier.measure([rough], [False])] == [fit.cylinder] * stands
+
+
 def test_a_fit_out_of_the_candidates_reach_gives_way_to_a_planned_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two pipes of a rack 8 cm apart: the outer edge of one and that of the other make a thick pipe."""
     rough = Candidate(replace(PIPE, radius=0.0436), 0.0023, 15000, CloudEvidence(2.6, 0.9, 0.0, 0.0032, 0.0, 3.0))
