@@ -115,7 +115,8 @@ class Search:
         if proposed.accept(candidate):
             return self.verifier.verify(candidate)
         least = proposed.slenderness * candidate.cylinder.radius
-        return proposed.of_piece().accept(candidate) and self.verifier.verify(candidate, least)
+        is_piece = proposed.of_piece().accept(candidate) or proposed.of_short_piece().accept(candidate)
+        return is_piece and self.verifier.verify(candidate, least)
 
     def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:
         """A hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""

@@ -19,6 +19,10 @@ _HALF_SECTOR = 2.5
 HALF_STEP = 0.1076
 # A piece that is as long as it is wide, in r, tells the axis as well as the radius.
 _PIECE = 2.0
+# One of half that length, in r, does so where its radius, and with it its axis, is known to this share of the radius:
+# over the three radii that the keyframes must show the axis is then known to a fortieth (from ends that are known to a
+# hundredth, a length beyond either: root 5 times as much).
+_SHORT_PIECE, _SURELY_KNOWN = 1.0, 0.01
 # With a greater standard deviation of the radius, in r, it lies by more than half a step from the true one for half of
 # the pipes, and the nearest standard size is most often a wrong one (0.75 quantile of the normal distribution: 0.674).
 VAGUEST = HALF_STEP / 0.674
@@ -87,6 +91,10 @@ class AcceptanceCriteria:
     def of_piece(self) -> AcceptanceCriteria:
         """The criteria for a piece of a pipe of which the cloud shows no more: as long as it is wide."""
         return replace(self, slenderness=_PIECE)
+
+    def of_short_piece(self) -> AcceptanceCriteria:
+        """The criteria for an even shorter piece, whose radius must be known the better."""
+        return replace(self, slenderness=_SHORT_PIECE, radius_sigma_max=_SURELY_KNOWN)
 
     def of_held_radius(self) -> AcceptanceCriteria:
         """The criteria where the radius was given, which leaves it open: the points fit it better than a plane."""

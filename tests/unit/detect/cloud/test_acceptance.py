@@ -96,6 +96,13 @@ def test_a_piece_is_as_long_as_it_is_wide() -> None:
     assert not piece.accept(candidate(replace(GOOD, flatness=1.44), length=2.05 * 0.1, radius=0.1))
 
 
+def test_a_shorter_piece_has_a_radius_that_is_known_the_better() -> None:
+    short = OUTSIDE.of_short_piece()
+    assert short.accept(candidate(length=1.05 * 0.1, radius=0.1, sigma=0.009))
+    assert not short.accept(candidate(length=1.05 * 0.1, radius=0.1, sigma=0.011))
+    assert not short.accept(candidate(length=0.95 * 0.1, radius=0.1, sigma=0.009))
+
+
 def test_of_a_held_radius_only_the_surface_is_judged() -> None:
     held = replace(candidate(replace(GOOD, flatness=1.01), sigma=0.2), radius_held=True)
     assert OUTSIDE.of_held_radius().accept(held)
