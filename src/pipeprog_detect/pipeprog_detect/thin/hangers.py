@@ -12,10 +12,12 @@ from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 # Rods are at most this long [m]: racks hang below a ceiling, not amid a room. Pipes of this length that come out of a
 # wall end in the open, or in a pipe.
 LONGEST = 1.0
-# What a rod carries begins within this distance of its end [m] (a clamp's or a rail's height), and is wider than the
-# rod: beyond what stereo spreads of that, two radii, this many points of the cloud lie within 3 cm of the axis. A
-# surface with a point in each square of 3 mm has two hundred in this ring; an edge crosses a quarter of it.
-REACH, WIDER, ASIDE, LEAST_POINTS = 0.08, 2.0, 0.03, 50
+# What a rod carries begins at most this far inside of its end [m] (a clamp's or a rail's height), and at most this far
+# beyond it: what lies on the rail, up to a pipe of DN100 (0.114 m), hides the rod's last part from those below.
+INSIDE, BEYOND = 0.08, 0.16
+# It is wider than the rod: beyond what stereo spreads of that, two radii, this many points of the cloud lie within 3 cm
+# of the axis. A surface with a point in each square of 3 mm has two hundred in this ring; an edge crosses a quarter.
+WIDER, ASIDE, LEAST_POINTS = 2.0, 0.03, 50
 
 
 def is_hanger(measured: MeasuredPipe, points: NDArray[np.floating]) -> bool:
@@ -26,8 +28,8 @@ def is_hanger(measured: MeasuredPipe, points: NDArray[np.floating]) -> bool:
     at_walls = [end.state == "wall" for end in measured.ends]
     if sum(at_walls) != 1:
         return False
-    end = cylinder.end if at_walls[0] else cylinder.start
-    near = points[(np.abs(points - end) < REACH + ASIDE).all(axis=1)]
-    aside = np.linalg.norm(cylinder.from_axis(near), axis=1)
-    across = (aside > WIDER * cylinder.radius) & (aside < ASIDE)
-    return int((across & (np.abs((near - end) @ cylinder.axis) < REACH)).sum()) >= LEAST_POINTS
+    end, out = (cylinder.end, cylinder.axis) if at_walls[0] else (cylinder.start, -cylinder.axis)
+    near = points[(np.abs(points - end) < BEYOND + ASIDE).all(axis=1)]
+    aside, along = np.linalg.norm(cylinder.from_axis(near), axis=1), (near - end) @ out
+    across = (aside > WIDER * cylinder.radius) & (aside < ASIDE) & (along > -INSIDE) & (along < BEYOND)
+    return int(across.sum()) >= LEAST_POINTS

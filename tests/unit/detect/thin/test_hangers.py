@@ -27,8 +27,9 @@ def tray(height: float) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
 
 
-@pytest.mark.parametrize("below", [-0.05, 0.0, 0.05])
+@pytest.mark.parametrize("below", [-0.05, 0.0, 0.05, 0.12])
 def test_a_rod_from_the_ceiling_to_a_tray_is_a_hanger(below: float) -> None:
+    """At the most, a pipe of DN100 on the tray hides the rod's last part."""
     assert is_hanger(rod(0.6, 0.0086, WALL, FREE), tray(2.6 - below))
 
 
