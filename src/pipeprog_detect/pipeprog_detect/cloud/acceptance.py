@@ -89,8 +89,11 @@ class AcceptanceCriteria:
         return replace(self, roughness=roughness)
 
     def of_piece(self) -> AcceptanceCriteria:
-        """The criteria for a piece of a pipe of which the cloud shows no more: as long as it is wide."""
-        return replace(self, slenderness=_PIECE)
+        """The criteria for a piece of a pipe of which the cloud shows no more: as long as it is wide.
+
+        The keyframes, which must verify it, tell it from the back of an elbow.
+        """
+        return replace(self, slenderness=_PIECE, slenderness_small_arc=_PIECE)
 
     def of_short_piece(self) -> AcceptanceCriteria:
         """The criteria for an even shorter piece, whose radius must be known the better."""

@@ -50,7 +50,8 @@ class KeyframeVerifier:
         Where the cloud resolves its section and has that radius as well, any support that makes a fit suffices. Where
         it does not, a glossy pipe's highlight may be taken for its contour, unless the radius is held to a planned one.
 
-        A candidate whose radius was held is verified by the side that they show of it.
+        A candidate whose radius was held, and one of which the cloud resolves the section and the keyframes show no
+        other side, is verified by the side that they show of it.
 
         `least_length` [m]: they must show it as long as that, however much of it the cloud has (a smooth white pipe
         gives stereo points at its ends alone).
@@ -68,6 +69,8 @@ class KeyframeVerifier:
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
         if candidate.blurred and (fit is None or not self._fitter.is_planned(fit)):
             fit = self._fitter.of_planned_radius(candidate, [], self._views)
+        if fit is None and is_resolved(candidate):
+            fit = self._fitter.of_visible_side(candidate, [], self._views)
         if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
             self._refused.append(cylinder)
             return False

@@ -93,6 +93,7 @@ def test_a_piece_is_as_long_as_it_is_wide() -> None:
     piece = OUTSIDE.of_piece()
     assert piece.accept(candidate(length=2.05 * 0.1, radius=0.1))
     assert not piece.accept(candidate(length=1.95 * 0.1, radius=0.1))
+    assert piece.accept(candidate(replace(GOOD, arc=np.radians(75.0)), length=2.05 * 0.1, radius=0.1))
     assert not piece.accept(candidate(replace(GOOD, flatness=1.44), length=2.05 * 0.1, radius=0.1))
 
 

@@ -132,6 +132,19 @@ def test_of_a_pipe_in_a_rack_one_side_suffices(
     assert [each.cylinder for each in verifier.measure([rough], [False])] == [fit.cylinder] * stands
 
 
+@pytest.mark.parametrize(("noise", "stands"), [(0.0004, True), (0.004, False)])
+def test_one_side_verifies_what_the_cloud_resolves(monkeypatch: pytest.MonkeyPatch, noise: float, stands: bool) -> None:
+    """A DN200 between two elbows at the lower border of the images: 75 deg of arc, and its upper side."""
+    arc = CloudEvidence(np.radians(75.0), 1.0, 0.02, noise, 0.0002, 188.0)
+    candidate = Candidate(replace(PIPE, radius=0.1119), 0.0012, 3000, arc)
+    found = replace(PIPE, radius=0.1095)
+    fit = ContourFit(found, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, 90.0, 20, (0.0, 0.0), 0.0, 0.5)
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: None)
+    monkeypatch.setattr(candidate_fit, "_of_one_side", lambda *_: fit)
+    monkeypatch.setattr(candidate_fit, "_with_surface", lambda *_: found)
+    assert KeyframeVerifier([looking_along_y(0.0, 0)], _boq(0.1095)).verify(candidate) is stands
+
+
 def test_a_fit_out_of_the_candidates_reach_gives_way_to_a_planned_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two pipes of a rack 8 cm apart: the outer edge of one and that of the other make a thick pipe."""
     rough = Candidate(replace(PIPE, radius=0.0436), 0.0023, 15000, CloudEvidence(2.6, 0.9, 0.0, 0.0032, 0.0, 3.0))
