@@ -179,7 +179,8 @@ def extended(scene: Scene) -> Cylinder:
         further = 0.0 if evidence is None else _further(evidence, max(CLAMP_RADII * cylinder.radius, CLAMP))
         end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
         if further:
-            free = free_stretches(Cylinder(end, end + further * out, cylinder.radius), scene.views, scene.others)
+            beyond = Cylinder(end, end + further * out, cylinder.radius)
+            free = free_stretches(beyond, scene.views, scene.others, known=cylinder)
             further = min([further, *(first for first, _ in free)])
         ends.append(end + further * out)
     return Cylinder(ends[0], ends[1], cylinder.radius)

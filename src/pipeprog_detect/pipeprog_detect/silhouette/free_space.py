@@ -33,22 +33,28 @@ def free_stretches(
 ) -> list[tuple[float, float]]:
     """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
 
-    A stretch whose contour is seen is a hole in the cloud of the pipe's face, unless the views see through less of the
-    `known` part than that: then the contour is that of something in line with the pipe.
+    A stretch whose contour is seen is a hole in the cloud of the pipe's face. But beyond a `known` part that is longer
+    than the stretch, and through less of which the views see, it is the contour of something in line with the pipe.
 
     Args:
         cylinder: whose axis is looked at, and whose contour decides where stereo has holes.
         views: the keyframes, with the depths of the nearest surfaces (`with_depths`).
         others: further cylinders, which may hide it.
-        known: the pipe before which the cylinder lies, where so much of it is known that it tells of its holes.
+        known: the pipe beyond whose end the cylinder lies.
     """
     stretches = _seen_through(cylinder, views, others)
-    holes = np.inf if known is None or not stretches else sum(b - a for a, b in _seen_through(known, views, others))
+    excused = np.inf if known is None or not stretches else _holes(known, views, others)
+    longest = 0.0 if known is None else known.length
     return [
         (first, last)
         for first, last in stretches
-        if last - first > max(holes, SHORTEST) or not _shows_a_contour(cylinder.cut(first, last), views, others)
+        if excused < last - first < longest or not _shows_a_contour(cylinder.cut(first, last), views, others)
     ]
+
+
+def _holes(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> float:
+    """Length [m] of a pipe that the views see through."""
+    return sum(last - first for first, last in _seen_through(cylinder, views, others))
 
 
 def _seen_through(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> list[tuple[float, float]]:

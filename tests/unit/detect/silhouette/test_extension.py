@@ -16,9 +16,10 @@ from pipeprog_detect.silhouette.contour_adjustment import adjusted
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.edge_support import support_profile
 from pipeprog_detect.silhouette.extension import extended, without_bend
+from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
-from tests.unit.detect.pipe_and_wall import PIPE
+from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
 
 END_TOLERANCE = 2e-3  # half a pixel
 SAMPLES_TOLERANCE = 0.03  # the contour alone tells an end to two samples of 6 px
@@ -79,6 +80,16 @@ def test_what_hides_a_pipe_does_not_end_it(pipe_views: list[View]) -> None:
     scene = Scene.of(known, pipe_views, [rod])
     twice = extended(replace(scene, cylinder=extended(scene)))
     assert (twice.end - PIPE.end) @ PIPE.axis == pytest.approx(0.0, abs=SAMPLES_TOLERANCE)
+
+
+def test_a_pipe_without_holes_does_not_grow_where_the_views_see_through(pipe_views: list[View]) -> None:
+    """Something in line with it has the contour that the images show beyond."""
+    surface = front_points(PIPE.cut(0.0, 0.28))
+    known = PIPE.cut(0.0, 0.24)
+    views = with_depths(pipe_views, np.concatenate([wall_points(), surface]))
+    whole = with_depths(pipe_views, np.concatenate([wall_points(), front_points(PIPE)]))
+    assert extended(Scene.of(known, whole, [])).length > 0.36
+    assert 0.24 <= extended(Scene.of(known, views, [])).length < 0.28 + PIPE.radius
 
 
 def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:

@@ -103,11 +103,23 @@ def test_a_hole_is_no_gap_where_its_contour_is_seen_in_part(pipe_views: list[Vie
     assert free_stretches(hole, with_depths(views, torn), []) == []
 
 
-def test_beyond_a_pipe_without_holes_a_contour_is_that_of_something_in_line(pipe_views: list[View]) -> None:
+@pytest.mark.parametrize(
+    ("torn", "known", "free"),
+    [
+        ([], (0.0, 0.25), True),
+        ([(0.05, 0.2)], (0.0, 0.25), False),
+        ([], (0.2, 0.25), False),
+    ],
+    ids=["no holes", "as many holes", "too short to tell"],
+)
+def test_beyond_a_pipe_without_holes_a_contour_is_that_of_something_in_line(
+    pipe_views: list[View], torn: list[tuple[float, float]], known: tuple[float, float], free: bool
+) -> None:
     surface = front_points(PIPE)
     along = (surface - PIPE.start) @ PIPE.axis
-    for torn, free in (((along < 0.25), True), ((along < 0.05) | ((along > 0.2) & (along < 0.25)), False)):
-        views = with_depths(pipe_views, np.concatenate([wall_points(), surface[torn]]))
-        beyond, known = PIPE.cut(0.25, 0.35), PIPE.cut(0.0, 0.25)
-        assert free_stretches(beyond, views, []) == []
-        assert bool(free_stretches(beyond, views, [], known=known)) is free
+    kept = along < 0.25
+    for low, high in torn:
+        kept &= (along < low) | (along > high)
+    views = with_depths(pipe_views, np.concatenate([wall_points(), surface[kept]]))
+    assert free_stretches(PIPE.cut(0.25, 0.35), views, []) == []
+    assert bool(free_stretches(PIPE.cut(0.25, 0.35), views, [], known=PIPE.cut(*known))) is free
