@@ -57,7 +57,7 @@ class KeyframeVerifier:
         gives stereo points at its ends alone).
         """
         cylinder = candidate.cylinder
-        if any(_resembles(cylinder, refused) for refused in self._refused):
+        if not self.has_views or any(_resembles(cylinder, refused) for refused in self._refused):
             return False
         if candidate.radius_held:
             stands = self._fitter.of_visible_side(candidate, [], self._views) is not None
