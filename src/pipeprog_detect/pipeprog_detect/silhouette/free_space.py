@@ -24,6 +24,9 @@ MIN_VIEWS, MIN_SHARE = 3, 0.5
 BEHIND_RADII = 1.2
 # A stretch whose contour is seen is no gap. It is looked at this often [px].
 SPACING = 6
+# A known part without holes tells that a stretch is none where it is this many times as long: after k times its length
+# without one the next is a hole with a probability of 1 / (k + 2) (Laplace's rule of succession), one in four.
+DENSE = 2.0
 # Free stretches shorter than this [m] are left out: two cells of a view's depths.
 SHORTEST = 0.03
 
@@ -33,8 +36,8 @@ def free_stretches(
 ) -> list[tuple[float, float]]:
     """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
 
-    A stretch whose contour is seen is a hole in the cloud of the pipe's face. But beyond a `known` part that is longer
-    than the stretch, and through less of which the views see, it is the contour of something in line with the pipe.
+    A stretch whose contour is seen is a hole in the cloud of the pipe's face. But beyond a `known` part that is much
+    longer, and through less of which the views see, it is the contour of something in line with the pipe.
 
     Args:
         cylinder: whose axis is looked at, and whose contour decides where stereo has holes.
@@ -44,7 +47,7 @@ def free_stretches(
     """
     stretches = _seen_through(cylinder, views, others)
     excused = np.inf if known is None or not stretches else _holes(known, views, others)
-    longest = 0.0 if known is None else known.length
+    longest = 0.0 if known is None else known.length / DENSE
     return [
         (first, last)
         for first, last in stretches

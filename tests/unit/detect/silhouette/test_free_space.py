@@ -108,7 +108,7 @@ def test_a_hole_is_no_gap_where_its_contour_is_seen_in_part(pipe_views: list[Vie
     [
         ([], (0.0, 0.25), True),
         ([(0.05, 0.2)], (0.0, 0.25), False),
-        ([], (0.2, 0.25), False),
+        ([], (0.1, 0.25), False),
     ],
     ids=["no holes", "as many holes", "too short to tell"],
 )
