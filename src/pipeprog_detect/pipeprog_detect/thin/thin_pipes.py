@@ -16,7 +16,7 @@ from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.thin.axis_sweep import propose_parallel
 from pipeprog_detect.thin.corners import is_corner
 from pipeprog_detect.thin.depth_from_cloud import covers, mean_centre
-from pipeprog_detect.thin.false_lines import is_false_line
+from pipeprog_detect.thin.false_lines import is_bare, is_false_line
 from pipeprog_detect.thin.line_fitter import LineFitter, turned
 from pipeprog_detect.thin.line_triangulation import propose
 from pipeprog_detect.thin.pair_views import pair_views
@@ -84,6 +84,8 @@ def find_thin_pipes(
         if is_no_pipe(fit.cylinder):
             return
         if is_false_line(fit.cylinder, fit, some, around.planes, views, known):
+            return
+        if is_bare(fit.cylinder, lines.points):
             return
         thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
         known.append(fit.cylinder)
