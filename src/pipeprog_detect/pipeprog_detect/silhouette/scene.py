@@ -106,6 +106,13 @@ class Scene:
         samples = contour_samples(self.cylinder, self.views, self.basis, spacing, margin)
         return samples.select(visible(samples, self.cylinder, self.views, self.others))
 
+    def visible_share(self) -> float:
+        """Share (0 to 1) of the positions along the cylinder, within the images, at which nothing hides its contour."""
+        samples = contour_samples(self.cylinder, self.views, self.basis, SPACING)
+        along, position = samples.positions()
+        seen = visible(samples, self.cylinder, self.views, self.others)
+        return len(np.unique(position[seen])) / max(len(along), 1)
+
     def edges(self, reach: float, spacing: int = SPACING, limit: int | None = None) -> tuple[ContourSamples, LimbEdges]:
         """Visible samples, `limit` at the most, and the limb edges within `reach` [px] of them.
 

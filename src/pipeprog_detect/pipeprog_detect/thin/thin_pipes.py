@@ -13,6 +13,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.thin.axis_sweep import propose_parallel
 from pipeprog_detect.thin.corners import is_corner
 from pipeprog_detect.thin.depth_from_cloud import covers, mean_centre
@@ -28,6 +29,8 @@ from pipeprog_detect.verification.scene_context import SceneContext
 # Proposals that are measured, and points of the cloud that bound their depths: a computing budget. More proposals than
 # a site has thin pipes cost time only.
 MOST_PROPOSED, MOST_POINTS = 40, 600_000
+# A line that walls and pipes would hide along more than half of its length was put at a wrong depth or slope.
+MOSTLY_SEEN = 0.5
 # The axes of pipes side by side are at least two radii apart.
 TOUCHING = 2.0
 # Their axes are known to this [m].
@@ -85,7 +88,7 @@ def find_thin_pipes(
             return
         if is_false_line(fit.cylinder, fit, some, around.planes, views, known):
             return
-        if is_bare(fit.cylinder, lines.points):
+        if is_bare(fit.cylinder, lines.points) or Scene.of(fit.cylinder, views, known).visible_share() < MOSTLY_SEEN:
             return
         thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
         known.append(fit.cylinder)

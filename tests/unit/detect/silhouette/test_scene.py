@@ -35,3 +35,17 @@ def test_a_step_away_from_the_cameras_that_see_a_pipe_does_not_move_their_images
 def test_without_a_view_that_shows_it_all_tell_where_a_cylinder_lies() -> None:
     passing = [raised(looking_along_y(0.0, 1), 1.5)]
     assert viewing_direction(LYING, passing) == pytest.approx(np.array([0.0, 1.2, -1.5]) / np.hypot(1.2, 1.5))
+
+
+@pytest.mark.parametrize("hidden", [0.0, 0.25, 0.75])
+def test_the_share_of_a_pipe_that_is_visible(hidden: float) -> None:
+    """A thick pipe before it hides its first part, from one place as far as `hidden` says."""
+    line = Cylinder(np.array([-0.5, 0.0, 0.0]), np.array([0.5, 0.0, 0.0]), 0.0086)
+    view = looking_along_y(0.0, 0)
+    reach = float(np.linalg.norm(view.centre)) - 0.3
+    edge = (hidden - 0.5) * reach / float(np.linalg.norm(view.centre))
+    before, up = np.array([edge - 1.0, -0.3, 0.0]), np.array([0.0, 0.0, 1.0])
+    column = Cylinder(before - up, before + up, 1.0)
+    others = [column] if hidden else []
+    assert Scene.of(line, [view], others).visible_share() == pytest.approx(1.0 - hidden, abs=0.06)
+    assert Scene.of(line.shifted(np.array([50.0, 0.0, 0.0])), [view], []).visible_share() == 0.0
