@@ -129,7 +129,7 @@ class KeyframeVerifier:
         if not self.has_views:
             return MeasuredPipe.of_cloud(candidate) if trusted else None
         fit = self._fitter.fit(candidate, others, self._views, trusted=trusted)
-        if fit is None and not trusted and not candidate.blurred:
+        if fit is None and not trusted and (candidate.radius_held or not candidate.blurred):
             fit = self._fitter.of_visible_side(candidate, others, self._views)
         if fit is None and not (trusted and is_resolved(candidate)):
             return None
