@@ -29,6 +29,9 @@ from pipeprog_sfm.sparse.overlap import OverlapReport
 from pipeprog_sfm.warm_up import warm_up
 
 IDLE_SECONDS = 1.0  # without a command, after which a map is published early: the next keyframe may never come
+# Without a command, after which a map that is not of all there is waits for the next one: keyframes of a walking camera
+# come at 2 to 3 Hz, and where none comes any more the pipes of the last map would wait for those of this one.
+HOLD_SECONDS = 0.5
 POLL_SECONDS = 0.1  # between checks whether the requested map is finished
 
 
@@ -153,13 +156,15 @@ def work(
     """As `serve`; `clock` tells seconds.
 
     A map is requested after `map_interval` keyframes, and one of all depth maps that can be made by then when no
-    command has come for IDLE_SECONDS; with None, no map but the last.
+    command has come for IDLE_SECONDS; with None, no map but the last. A map that is finished in a silence of
+    HOLD_SECONDS is sent after the next command, and not at all where the one of all depth maps follows.
     """
     for earlier in answered:
         _answer(reconstruction, earlier)
         reconstruction.update_dense()
     channel.send(Ready())
     since_map, settled, idle_since = 0, True, clock()
+    held: MetricMap | None = None
     while True:
         busy = map_interval is not None and (not settled or reconstruction.is_mapping)
         came = channel.poll(POLL_SECONDS if busy else None)
@@ -168,7 +173,7 @@ def work(
             if isinstance(command, Finish):
                 reconstruction.move(command.motion)
                 channel.send(_finish(channel, reconstruction, command))
-                since_map, settled = 0, True  # a map after the last one would have a stamp that no pipes have
+                since_map, settled, held = 0, True, None  # one after the last map would have a stamp without pipes
                 continue
             channel.send(_answer(reconstruction, command))
             if isinstance(command, AddKeyframe):
@@ -178,14 +183,16 @@ def work(
         if map_interval is None:
             continue
         try:
-            metric_map = reconstruction.finished_map()
+            held = reconstruction.finished_map() or held
         except NotMetricError:
-            metric_map, since_map = None, map_interval
-        if metric_map is not None:
-            channel.send(MapReady(reconstruction.status(), metric_map))
-        idle = not settled and clock() - idle_since > IDLE_SECONDS
+            held, since_map = None, map_interval
+        silence = clock() - idle_since
+        if held is not None and (settled or silence < HOLD_SECONDS):
+            channel.send(MapReady(reconstruction.status(), held))
+            held = None
+        idle = not settled and silence > IDLE_SECONDS
         if not reconstruction.is_mapping and ((came and since_map >= map_interval) or idle):
-            settled = idle
+            settled, held = idle, None
             with contextlib.suppress(NotMetricError):  # the status says why, the next keyframe may measure the scale
                 reconstruction.request_map(settled)
                 since_map = 0

@@ -10,7 +10,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm import worker
 from pipeprog_sfm.reconstruction import NotMetricError
-from pipeprog_sfm.worker import IDLE_SECONDS, POLL_SECONDS
+from pipeprog_sfm.worker import HOLD_SECONDS, IDLE_SECONDS, POLL_SECONDS
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 KEYFRAME = worker.AddKeyframe(1, b"", CAMERA)
@@ -18,9 +18,10 @@ MAP_INTERVAL = 3
 
 
 class Prompt:
-    """Stands for a Reconstruction whose maps are there as soon as they are asked for."""
+    """Stands for a Reconstruction whose maps are there at once, or the `looks`-th time that they are looked for."""
 
-    def __init__(self, metric_after: int = 0) -> None:
+    def __init__(self, metric_after: int = 0, looks: int = 1) -> None:
+        self.looks, self.looked = looks, 0
         self.is_mapping = False
         self.keyframes: list[int] = []
         self.settled = False
@@ -53,6 +54,10 @@ class Prompt:
         self.is_mapping, self.settled = True, settled
 
     def finished_map(self) -> str | None:
+        self.looked += self.is_mapping
+        if self.looked < self.looks:
+            return None
+        self.looked = 0
         ready, self.is_mapping = self.is_mapping, False
         return ("settled map" if self.settled else "early map") if ready else None
 
@@ -96,11 +101,12 @@ def events(
     answered: tuple[worker.AddKeyframe, ...] = (),
     map_interval: int | None = MAP_INTERVAL,
     metric_after: int = 0,
+    looks: int = 1,
 ) -> list[Any]:
     """What the loop sends until the connection closes."""
     script = Script(*steps)
     with pytest.raises(EOFError):
-        worker.work(script, cast(Any, Prompt(metric_after)), map_interval, answered, lambda: script.now)
+        worker.work(script, cast(Any, Prompt(metric_after, looks)), map_interval, answered, lambda: script.now)
     return script.events
 
 
@@ -138,6 +144,20 @@ def test_the_first_map_comes_with_the_keyframe_that_measures_the_scale() -> None
 def test_after_a_map_at_the_last_keyframe_comes_one_of_all_there_is() -> None:
     sent = events(*[KEYFRAME] * MAP_INTERVAL, 10 * IDLE_SECONDS)
     assert [event.map for event in sent[1 + MAP_INTERVAL :]] == ["early map", "settled map"]
+
+
+def test_a_map_that_is_finished_in_a_silence_waits_for_the_next_keyframe() -> None:
+    looks = round(0.7 * IDLE_SECONDS / POLL_SECONDS)
+    assert HOLD_SECONDS < 0.6 * IDLE_SECONDS
+    walk = [KEYFRAME] * MAP_INTERVAL
+    sent = events(*walk, 0.9 * IDLE_SECONDS, KEYFRAME, 0.1 * IDLE_SECONDS, looks=looks)
+    assert [type(event) for event in sent[1 + MAP_INTERVAL :]] == [worker.KeyframeDone, worker.MapReady]
+    assert sent[-1].map == "early map"
+    sent = events(*walk, 10 * IDLE_SECONDS, looks=looks)
+    assert [event.map for event in sent[1 + MAP_INTERVAL :]] == ["settled map"]
+    sent = events(*walk, 0.9 * IDLE_SECONDS, worker.Finish(), 10 * IDLE_SECONDS, looks=looks)
+    assert [type(event) for event in sent[1 + MAP_INTERVAL :]] == [worker.MapReady, worker.Finished]
+    assert sent[-2].map == "last map"
 
 
 def test_a_camera_at_rest_without_a_scale_is_not_asked_again() -> None:
