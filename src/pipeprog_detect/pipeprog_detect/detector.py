@@ -171,7 +171,9 @@ def detect_outside(
     measured += _genuine(lost, around, judging)
     measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)
     measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
-    whole = _judged(with_open_ends(joined(measured, judging), around, judging), judging, has_two_edges)
+    # Ends on either side of what hides a pipe may be expected beyond each other: then both pieces are of one pipe.
+    whole = joined(with_open_ends(joined(measured, judging), around, judging), judging, overlapping=True)
+    whole = _judged(whole, judging, has_two_edges)
     ended = _abutted(with_grown_ends(whole, judging), around, judging)
     standing = [each for each in ended if not is_hanger(each, prepared.points)]
     return [each for each in standing if each.cylinder.length >= config.length_min]

@@ -58,13 +58,14 @@ class MeasuredPipe:
         return cls(candidate, candidate.cylinder.cut_like(fit.cylinder), sigma)
 
 
-def joined(measured: Sequence[MeasuredPipe], views: Sequence[View]) -> list[MeasuredPipe]:
+def joined(measured: Sequence[MeasuredPipe], views: Sequence[View], overlapping: bool = False) -> list[MeasuredPipe]:
     """The pipes with collinear pieces joined; the radius is that of the piece with the least standard deviation.
 
-    Pieces of two radii are two pipes, and so are those between which the views see what is behind them.
+    Pieces of two radii are two pipes, and so are those between which the views see what is behind them. Only those that
+    lie within each other are joined where `overlapping` is asked for.
     """
     whole = []
-    for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views):
+    for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views, overlapping):
         best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
         cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
         points = sum(measured[piece].candidate.points for piece in pieces)
@@ -79,7 +80,7 @@ def joined(measured: Sequence[MeasuredPipe], views: Sequence[View]) -> list[Meas
 
 
 def _without_gaps(
-    groups: Sequence[Sequence[int]], measured: Sequence[MeasuredPipe], views: Sequence[View]
+    groups: Sequence[Sequence[int]], measured: Sequence[MeasuredPipe], views: Sequence[View], overlapping: bool
 ) -> list[list[int]]:
     """The groups of collinear pieces, parted where two neighbours on the axis are not one pipe."""
     parted = []
@@ -88,7 +89,8 @@ def _without_gaps(
         ordered = sorted(group, key=lambda piece: float(measured[piece].cylinder.middle @ axis))
         part = [ordered[0]]
         for piece in ordered[1:]:
-            if not _continues(measured[part[-1]], measured[piece], views):
+            before, after = measured[part[-1]], measured[piece]
+            if not _continues(before, after, views) or (overlapping and not _overlap(before, after)):
                 parted.append(part)
                 part = []
             part.append(piece)
@@ -106,6 +108,12 @@ def _continues(one: MeasuredPipe, other: MeasuredPipe, views: Sequence[View]) ->
     start, end = min(ends, key=lambda pair: float(np.linalg.norm(pair[0] - pair[1])))
     gap = Cylinder(start, end, one.cylinder.radius)
     return gap.length <= SHORTEST or not free_stretches(gap, views, [])
+
+
+def _overlap(one: MeasuredPipe, other: MeasuredPipe) -> bool:
+    """Whether two collinear pieces lie within each other along the first one's axis."""
+    ends = one.cylinder.along(np.stack([other.cylinder.start, other.cylinder.end]))
+    return bool(ends.min() < one.cylinder.length and ends.max() > 0.0)
 
 
 def is_stub(cylinder: Cylinder) -> bool:

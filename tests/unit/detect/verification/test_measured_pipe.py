@@ -48,6 +48,16 @@ def test_pieces_are_one_pipe_where_nothing_is_seen_between_them() -> None:
     assert len(joined([left, thicker], whole)) == 2
 
 
+def test_ends_that_are_expected_beyond_each_other_are_of_one_pipe() -> None:
+    """Two pieces on either side of what hides the rest; a gap that is left between them was judged before."""
+    for gap, count in ((-0.2, 1), (-0.01, 1), (0.01, 2), (0.2, 2)):
+        assert len(joined(in_line(gap, 0.003, 0.0365, 0.0365), [], overlapping=True)) == count
+    assert len(joined(in_line(-0.2, 0.003, 0.0365, 0.0575), [], overlapping=True)) == 2
+    assert len(joined(in_line(-0.2, 0.03, 0.0365, 0.0365), [], overlapping=True)) == 2
+    [whole] = joined(in_line(-0.2, 0.0, 0.0365, 0.0365), [], overlapping=True)
+    assert abs(whole.cylinder.length - 2.0 * HALF) < 1e-9
+
+
 def in_line(gap: float, offset: float, first: float, second: float) -> list[MeasuredPipe]:
     """Two pipes along x with a gap [m] about 0, the second one `offset` [m] higher, of two radii [m]."""
 
