@@ -164,7 +164,7 @@ def work(
         reconstruction.update_dense()
     channel.send(Ready())
     since_map, settled, idle_since = 0, True, clock()
-    held: MetricMap | None = None
+    held: MapReady | None = None
     while True:
         busy = map_interval is not None and (not settled or reconstruction.is_mapping)
         came = channel.poll(POLL_SECONDS if busy else None)
@@ -183,12 +183,14 @@ def work(
         if map_interval is None:
             continue
         try:
-            held = reconstruction.finished_map() or held
+            finished = reconstruction.finished_map()
         except NotMetricError:
-            held, since_map = None, map_interval
+            finished, since_map = None, map_interval
+        if finished is not None:
+            held = MapReady(reconstruction.status(), finished)
         silence = clock() - idle_since
         if held is not None and (settled or silence < HOLD_SECONDS):
-            channel.send(MapReady(reconstruction.status(), held))
+            channel.send(held)
             held = None
         idle = not settled and silence > IDLE_SECONDS
         if not reconstruction.is_mapping and ((came and since_map >= map_interval) or idle):

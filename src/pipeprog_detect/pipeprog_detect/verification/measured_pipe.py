@@ -90,7 +90,7 @@ def _without_gaps(
         part = [ordered[0]]
         for piece in ordered[1:]:
             before, after = measured[part[-1]], measured[piece]
-            if not _continues(before, after, views) or (overlapping and not _overlap(before, after)):
+            if (overlapping and not _overlap(before, after)) or not _continues(before, after, views):
                 parted.append(part)
                 part = []
             part.append(piece)
