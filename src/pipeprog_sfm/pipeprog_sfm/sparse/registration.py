@@ -22,8 +22,8 @@ MIN_INLIERS = 20  # of a pose: by chance one match in 18 000 lies within 4 px (o
 RIVAL = 0.5  # of a pose's inliers: if this share agrees on another pose, repeated texture makes the pose ambiguous
 MIN_SHARE = 0.25  # of the matches with the neighbours that must agree with a pose: a wrong pose has few per cent
 LOCAL_WINDOW = 8  # views that local bundle adjustment moves: those that see a point at 80 % overlap, and some more
-# Of the points that the views around it in time hold, a share from which on a view's velocity, and so its pose, may be
-# wrong: with the velocity off by 0.7 m/s (read-out 30 ms, a path that turned) a view held 0.4 of them.
+# Of the share of features with a point that the views around it in time have, the part below which a view's velocity,
+# and so its pose, may be wrong: with the velocity off by 0.7 m/s (read-out 30 ms, a path that turned) it had 0.4.
 DOUBTFUL, AROUND = 0.6, 4
 # Of the points that the views before and after a moment share, usually; with less, a few views at an end may have poses
 # and velocities of their own: 0.15 was seen at 1.4 m/s and 20 ms (two views 0.8 m off), 0.5 at ends and in turns.
@@ -104,7 +104,10 @@ def rejection_reason(model: SparseModel, view: int, matches: Mapping[int, MatchA
 
 
 def doubtful_views(model: SparseModel, keyframes: Mapping[int, Keyframe]) -> list[int]:
-    """Views that hold far fewer points than the `AROUND` views of their camera nearest in time, or hang on by few.
+    """Views that hang on by few points, or whose features have far fewer of them than those of views around.
+
+    These are the `AROUND` views of their camera nearest in time; what is compared is the share of the features, as
+    some views have fewer than others.
 
     With a rolling shutter a view that is registered before what follows it may take a wrong velocity where the camera
     turns; features that are unrolled by it agree with a wrong pose, which confirms the velocity. Up to `AROUND` views
@@ -118,7 +121,7 @@ def doubtful_views(model: SparseModel, keyframes: Mapping[int, Keyframe]) -> lis
         own = np.flatnonzero(frames == frame)
         own = own[np.argsort(stamps[own])]
         seen = [model.seen(view) for view in own]
-        held = np.array([len(points) for points in seen])
+        held = np.array([(model.point_of[model.features(view)] >= 0).mean() for view in own])
         for number, view in enumerate(own.tolist()):
             others = np.delete(np.arange(len(own)), number)
             near = others[np.argsort(np.abs(stamps[own[others]] - stamps[view]), kind="stable")[:AROUND]]
@@ -132,13 +135,14 @@ def doubtful_views(model: SparseModel, keyframes: Mapping[int, Keyframe]) -> lis
 
 def _pieces(seen: Sequence[IntArray]) -> list[IntArray]:
     """A trajectory cut where views share few points across a moment; `seen`: the points of each view in order."""
-    shared = np.array(
-        [
-            len(np.intersect1d(np.concatenate(seen[max(now - AROUND, 0) : now]), np.concatenate(seen[now:][:AROUND])))
-            for now in range(1, len(seen))
-        ]
-    )
+    shared = np.array([_shared(seen[max(now - AROUND, 0) : now], seen[now:][:AROUND]) for now in range(1, len(seen))])
     return np.split(np.arange(len(seen)), np.flatnonzero(shared < LOOSE * np.median(shared)) + 1 if len(shared) else [])
+
+
+def _shared(before: Sequence[IntArray], after: Sequence[IntArray]) -> float:
+    """The points that two groups of views share, as a share of those of the one that sees fewer."""
+    one, other = np.unique(np.concatenate(before)), np.unique(np.concatenate(after))
+    return len(np.intersect1d(one, other, assume_unique=True)) / max(min(len(one), len(other)), 1)
 
 
 def epipolar_errors(model: SparseModel, view: int, other: int, matches: MatchArray) -> FloatArray:

@@ -13,8 +13,10 @@ import pytest
 from numpy.typing import NDArray
 from scenes import CAMERA, STEP, pose, position_errors, view
 
+from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
+from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.registration import doubtful_views
 from pipeprog_sfm.sparse.row_motion import told_by_rows
@@ -70,6 +72,25 @@ def test_the_path_is_that_of_a_global_shutter(told: tuple[Mapper, dict[int, NDAr
     # As the same walk with a global shutter in test_mapper; ends of the walk are held by their own rows alone.
     assert position_errors(poses, truth).max() < 2e-3
     assert 0.25 < mapper.map.reprojection_error() < 0.45
+
+
+@pytest.mark.parametrize(("readout", "features"), [(READOUT, [4000, 4000, 4000, 1000, 4000]), (0.0, [4000] * 5)])
+def test_keyframes_that_tell_the_motion_alone_get_few_features(readout: float, features: list[int]) -> None:
+    """Those between two that show the same; the last one is none."""
+    asked = []
+
+    def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Features:
+        asked.append(config.max_features)
+        number = int(gray[0, 0])
+        time = number * STEP * 1e-9
+        seen = view(camera_at(time), number, motion=replace(motion_at(time), readout=readout))
+        few = np.random.default_rng(number).permutation(len(seen))[: config.max_features]
+        return Features(seen.keypoints[few], seen.descriptors[few])
+
+    mapper = Mapper(MapperConfig(), extract_features=extract, readout=readout)
+    for number in (0, 2, 3, 1, 5):
+        assert mapper.add(number * STEP, np.full((2, 2), number, np.uint8), CAMERA).registered or number == 0
+    assert asked == features
 
 
 def test_a_fast_start_leaves_no_error() -> None:
