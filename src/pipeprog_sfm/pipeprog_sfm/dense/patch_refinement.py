@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pipeprog_sfm.dense.row_mapping import RowMapping, at_other_row, at_row, time_at
+from pipeprog_sfm.dense.row_mapping import RowMapping, at_other_row, at_row
 
 RADIUS = 2  # of a patch [px]: 5 x 5, smaller than the thinnest pipe at working distance
 SIZE = (2 * RADIUS + 1) ** 2
@@ -27,7 +27,6 @@ GAIN_MIN, GAIN_MAX = 0.7, 1.4  # of one view's contrast over another's: exposure
 NOISE = 0.7  # [grey levels] of two 8-bit images' difference at best
 FLATNESS = 2e-4  # of the depth: how far a pipe of 50 mm bulges over the plane's 9 px at 2 m, 0.4 mm
 OVERLAP = (2 * RADIUS + 1) ** 2 / 4.0  # patches that share a pixel on a grid of stride 2: their errors go together
-ROW_STEPS = 1  # after the first, from the row at the stamp to the one that shows a patch: 0.01 px are left
 ROUNDS = (4, 2)  # distance in grid pixels at which each round takes over planes: beyond PLANE_RADIUS, on other data
 
 
@@ -154,7 +153,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
             continue
         patch = np.empty(SIZE, np.float32)
         scores = np.empty(len(neighbours), np.float32)
-        row_h, row_e = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+        turned, moved = np.empty((2, len(neighbours), 3), np.float32)
         for column in range(width):
             u = column * stride
             if u < RADIUS or u >= image.shape[1] - RADIUS or not inverse_depth[row, column] > 0.0:
@@ -168,6 +167,9 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
             for k in range(SIZE):
                 patch[k] -= mean
                 energy += patch[k] * patch[k]
+            if rows is not None:
+                for n in range(len(neighbours)):
+                    at_row(homographies[n], epipoles[n], rows, n, u, v, turned[n], moved[n])
             best_depth = best_step = best_sigma = np.float32(0.0)
             best = np.float32(-2.0)
             for candidate in range(5):
@@ -188,7 +190,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
                     continue
                 score, step, sigma = _match(
                     patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores,
-                    rows, row_h, row_e,
+                    rows, turned, moved,
                 )  # fmt: skip
                 if score > best:
                     best_depth, best, best_step, best_sigma = depth, score, step, sigma
@@ -204,7 +206,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _match(  # type: ignore[no-untyped-def]
-    patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores, rows, row_h, row_e,
+    patch, energy, neighbours, homographies, epipoles, u, v, depth, su, sv, better_half, scores, rows, turned, moved,
 ):  # fmt: skip
     """Mean correlation over the better half of the views, Gauss-Newton step of the inverse depth, sigma (0: unseen).
 
@@ -217,18 +219,23 @@ def _match(  # type: ignore[no-untyped-def]
     pixels = neighbours.reshape(len(neighbours), height * width)
     for n in range(len(neighbours)):
         scores[n] = -1.0
-        h, e = homographies[n], epipoles[n]
-        if rows is not None:
-            _at_rows(h, e, rows, n, u, v, depth, row_h, row_e)
-            h, e = row_h, row_e
-        z = one / (h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * depth)
-        x = (h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * depth) * z
-        y = (h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * depth) * z
-        # the plane-induced homography is affine over so small a patch
-        zu, zv = h[2, 0] + e[2] * su, h[2, 1] + e[2] * sv
-        xu, xv = (h[0, 0] + e[0] * su - x * zu) * z, (h[0, 1] + e[0] * sv - x * zv) * z
-        yu, yv = (h[1, 0] + e[1] * su - y * zu) * z, (h[1, 1] + e[1] * sv - y * zv) * z
-        dx, dy = (e[0] - e[2] * x) * z, (e[1] - e[2] * y) * z
+        h = homographies[n]
+        if rows is None:
+            ex, ey, ez = epipoles[n, 0], epipoles[n, 1], epipoles[n, 2]
+            z = h[2, 0] * u + h[2, 1] * v + h[2, 2] + ez * depth
+            x = h[0, 0] * u + h[0, 1] * v + h[0, 2] + ex * depth
+            y = h[1, 0] * u + h[1, 1] * v + h[1, 2] + ey * depth
+        else:
+            x, y, z, ex, ey, ez = at_other_row(turned[n], moved[n], rows, n, depth)
+        z = one / z
+        x *= z
+        y *= z
+        # The plane-induced homography is affine over so small a patch. Its rows turn it by 0.01 rad at most, 0.02 px
+        # at its border: these derivatives are those of the stamps.
+        zu, zv = h[2, 0] + ez * su, h[2, 1] + ez * sv
+        xu, xv = (h[0, 0] + ex * su - x * zu) * z, (h[0, 1] + ex * sv - x * zv) * z
+        yu, yv = (h[1, 0] + ey * su - y * zu) * z, (h[1, 1] + ey * sv - y * zv) * z
+        dx, dy = (ex - ez * x) * z, (ey - ez * y) * z
         reach_x, reach_y = RADIUS * (abs(xu) + abs(xv)), RADIUS * (abs(yu) + abs(yv))
         inside = x - reach_x >= 0.0 and y - reach_y >= 0.0
         if not (inside and x + reach_x < width - 1 and y + reach_y < height - 1):
@@ -291,26 +298,6 @@ def _moments(patch, pixels, width, across, down):  # type: ignore[no-untyped-def
         cp += c * p
         cw += c * w
     return sw, sc, ww, wp, cc, cp, cw
-
-
-@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
-def _at_rows(homography, epipole, rows, n, u, v, depth, h, e):  # type: ignore[no-untyped-def]
-    """Writes to h (3, 3) and e (3,) the mapping at the times of the rows that show the patch.
-
-    Within the patch both images move on alike: one time is that of all its rows.
-    """
-    at_row(homography, epipole, rows, n, rows.times[v, u], h, e)
-    a, shift = rows.other_turned[n, 0], rows.other_moved[n]
-    px = h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * depth
-    py = h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * depth
-    pz = h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * depth
-    time = time_at(rows.other_times[n], px / pz, py / pz)
-    for _ in range(ROW_STEPS):
-        x = px + time * (a[0, 0] * px + a[0, 1] * py + a[0, 2] * pz + depth * shift[0])
-        y = py + time * (a[1, 0] * px + a[1, 1] * py + a[1, 2] * pz + depth * shift[1])
-        z = pz + time * (a[2, 0] * px + a[2, 1] * py + a[2, 2] * pz + depth * shift[2])
-        time = time_at(rows.other_times[n], x / z, y / z)
-    at_other_row(rows, n, time, h, e)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")

@@ -98,24 +98,21 @@ def _cost_volume(census, others, homographies, epipoles, least, step, count, row
         seen = np.empty(count, np.uint32)
         first = np.empty(count, np.int32)
         second = np.empty(count, np.int32)
-        row_h, row_e = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+        turned, moved = np.empty((2, 3), np.float32)
         for u in range(width):
             first[:] = 255
             second[:] = 255
             for n in range(number):
                 h, e = homographies[n], epipoles[n]
-                if rows is not None:
-                    at_row(h, e, rows, n, rows.times[v, u], row_h, row_e)
-                    h, e = row_h, row_e
-                x = np.float32(h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * least)
-                y = np.float32(h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * least)
-                z = np.float32(h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * least)
-                size = np.int32(other_width), np.int32(other_height)
                 if rows is None:
+                    x = np.float32(h[0, 0] * u + h[0, 1] * v + h[0, 2] + e[0] * least)
+                    y = np.float32(h[1, 0] * u + h[1, 1] * v + h[1, 2] + e[1] * least)
+                    z = np.float32(h[2, 0] * u + h[2, 1] * v + h[2, 2] + e[2] * least)
+                    size = np.int32(other_width), np.int32(other_height)
                     _project((x, y, z), (e[0] * step, e[1] * step, e[2] * step), size, places)
                 else:
-                    moving = (e[0] * step, e[1] * step, e[2] * step)
-                    _project_rolled((x, y, z), moving, (least, step), rows, n, places)
+                    at_row(h, e, rows, n, u, v, turned, moved)
+                    _project_rolled(turned, moved, (least, step), rows, n, places)
                 for d in range(count):
                     seen[d] = codes[n, np.uint32(places[d])]
                 _compare(census[v, u], seen, first, second)
@@ -144,29 +141,46 @@ def _project(start, step, size, places):  # type: ignore[no-untyped-def]
         places[d] = np.int32(np.int32(row * width) + column) if inside else np.int32(0)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _project_rolled(start, step, inverse, rows, n, places):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, inline="always", fastmath=True, error_model="numpy")
+def _project_rolled(turned, moved, inverse, rows, n, places):  # type: ignore[no-untyped-def]
     """`_project` to neighbour n with rolling rows; `inverse`: of hypothesis 0, and from one to the next.
 
-    The lens's distortion of the row and the square of the turn are left to the refinement: 0.3 px at most.
+    `turned` and `moved` (3,) are from `at_row`. The time of the neighbour's row, f + l y / z, multiplies what turns and
+    moves the point; times z, each coordinate is a square polynomial of the hypothesis, without a division. The lens's
+    distortion of the row and the square of the turn are left to the refinement: 0.3 px at most.
     """
-    x, y, z = start
-    dx, dy, dz = step
-    (a, b, c), (p, q, r), (f, g, h) = rows.other_turned[n, 0]
-    right, down, ahead = rows.other_moved[n]
+    a, shift = rows.other_turned[n, 0], rows.other_moved[n]
     first, later = rows.other_clocks[n]
     height, width = np.int32(rows.other_times.shape[1]), np.int32(rows.other_times.shape[2])
-    least, wider = inverse
+    least, step = inverse
+    x, y, z = turned[0] + least * moved[0], turned[1] + least * moved[1], turned[2] + least * moved[2]
+    dx, dy, dz = step * moved[0], step * moved[1], step * moved[2]
+    time, time_step = first * z + later * y, first * dz + later * dy
+    x0, x1, x2 = _rolled_polynomial(x, dx, z, dz, time, time_step, a[0], (x, y, z), (dx, dy, dz), shift[0], inverse)
+    y0, y1, y2 = _rolled_polynomial(y, dy, z, dz, time, time_step, a[1], (x, y, z), (dx, dy, dz), shift[1], inverse)
+    z0, z1, z2 = _rolled_polynomial(z, dz, z, dz, time, time_step, a[2], (x, y, z), (dx, dy, dz), shift[2], inverse)
     for d in range(len(places)):
         k = np.float32(d)
-        px, py, pz = x + dx * k, y + dy * k, z + dz * k
-        time = first + later * py / pz
-        i = least + wider * k
-        scale = np.float32(1.0) / (pz + time * (f * px + g * py + h * pz + i * ahead))
-        column = np.int32((px + time * (a * px + b * py + c * pz + i * right)) * scale + np.float32(0.5))
-        row = np.int32((py + time * (p * px + q * py + r * pz + i * down)) * scale + np.float32(0.5))
+        scale = np.float32(1.0) / (z0 + k * (z1 + k * z2))
+        column = np.int32((x0 + k * (x1 + k * x2)) * scale + np.float32(0.5))
+        row = np.int32((y0 + k * (y1 + k * y2)) * scale + np.float32(0.5))
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         places[d] = np.int32(np.int32(row * width) + column) if inside else np.int32(0)
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _rolled_polynomial(c, dc, z, dz, time, time_step, a, point, step, shift, inverse):  # type: ignore[no-untyped-def]
+    """Coefficients of one coordinate of a homogeneous pixel, times z: c z + t (a p + i shift).
+
+    All of c, z, t, p and i are linear in the hypothesis; each is given at the first one, and its step.
+    """
+    turn = a[0] * point[0] + a[1] * point[1] + a[2] * point[2] + inverse[0] * shift
+    turn_step = a[0] * step[0] + a[1] * step[1] + a[2] * step[2] + inverse[1] * shift
+    return (
+        c * z + time * turn,
+        c * dz + dc * z + time * turn_step + time_step * turn,
+        dc * dz + time_step * turn_step,
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -26,6 +26,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage, row_of, shown_at
 from pipeprog_sfm.dense.depth_sampling import depth_at
 
+_ROW_STEPS = 1  # after the first, from the row at the stamp to the one that shows a point: 0.01 px are left
 # Steps from a pixel at the stamp to where the image shows it: the depth is looked up anew in each.
 _STEPS = 3
 # The last step moves a pixel by less than this [px], or the pixel is hidden at the stamp: a contour lies between.
@@ -104,33 +105,47 @@ def _cross(vector: FloatArray) -> FloatArray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def at_row(homography, epipole, rows, n, time, h, e):  # type: ignore[no-untyped-def]
-    """Writes H(t) and e(t) of neighbour n to h (3, 3) and e (3,)."""
+# What takes a mapping is inlined: a call copies all that it holds, which takes as long as the patch itself.
+@njit(cache=True, nogil=True, inline="always", fastmath=True, error_model="numpy")
+def at_row(homography, epipole, rows, n, u, v, turned, moved):  # type: ignore[no-untyped-def]
+    """Writes H(t) x and e(t) of neighbour n, for the pixel x = (u, v) and the time t of its row, to two (3,)."""
+    time = rows.times[v, u]
     square = time * time
+    h, first, second = homography, rows.turned[n, 0], rows.turned[n, 1]
     for i in range(3):
-        for j in range(3):
-            h[i, j] = homography[i, j] + time * rows.turned[n, 0, i, j] + square * rows.turned[n, 1, i, j]
-        e[i] = epipole[i] + time * rows.moved[n, 0, i] + square * rows.moved[n, 1, i]
+        still = h[i, 0] * u + h[i, 1] * v + h[i, 2]
+        linear = first[i, 0] * u + first[i, 1] * v + first[i, 2]
+        squared = second[i, 0] * u + second[i, 1] * v + second[i, 2]
+        turned[i] = still + time * linear + square * squared
+        moved[i] = epipole[i] + time * rows.moved[n, 0, i] + square * rows.moved[n, 1, i]
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def at_other_row(rows, n, time, h, e):  # type: ignore[no-untyped-def]
-    """Turns and moves H(t) (3, 3) and e(t) (3,) on until the time s of a row of neighbour n, in place."""
-    a, b = rows.other_turned[n, 0], rows.other_turned[n, 1]
+@njit(cache=True, nogil=True, inline="always", fastmath=True, error_model="numpy")
+def at_other_row(turned, moved, rows, n, inverse):  # type: ignore[no-untyped-def]
+    """Homogeneous pixel (3) of neighbour n, at the time of its own row, and its derivative (3) by the inverse depth.
+
+    `turned` and `moved` (3,) are from `at_row`; the derivative is up to the square of the turn.
+    """
+    a, b, shift = rows.other_turned[n, 0], rows.other_turned[n, 1], rows.other_moved[n]
+    px, py, pz = turned[0] + inverse * moved[0], turned[1] + inverse * moved[1], turned[2] + inverse * moved[2]
+    rx = a[0, 0] * px + a[0, 1] * py + a[0, 2] * pz + inverse * shift[0]
+    ry = a[1, 0] * px + a[1, 1] * py + a[1, 2] * pz + inverse * shift[1]
+    rz = a[2, 0] * px + a[2, 1] * py + a[2, 2] * pz + inverse * shift[2]
+    time = rows.other_clocks[n, 0] + rows.other_clocks[n, 1] * py / pz
+    scale = np.float32(1.0) / (pz + time * rz)
+    time = time_at(rows.other_times[n], (px + time * rx) * scale, (py + time * ry) * scale)
     square = time * time
-    for j in range(3):
-        x, y, z = h[0, j], h[1, j], h[2, j]
-        for i in range(3):
-            turn = a[i, 0] * x + a[i, 1] * y + a[i, 2] * z
-            h[i, j] += time * turn + square * (b[i, 0] * x + b[i, 1] * y + b[i, 2] * z)
-    x, y, z = e[0], e[1], e[2]
-    for i in range(3):
-        turn = a[i, 0] * x + a[i, 1] * y + a[i, 2] * z + rows.other_moved[n, i]
-        e[i] += time * turn + square * (b[i, 0] * x + b[i, 1] * y + b[i, 2] * z)
+    x = px + time * rx + square * (b[0, 0] * px + b[0, 1] * py + b[0, 2] * pz)
+    y = py + time * ry + square * (b[1, 0] * px + b[1, 1] * py + b[1, 2] * pz)
+    z = pz + time * rz + square * (b[2, 0] * px + b[2, 1] * py + b[2, 2] * pz)
+    ex, ey, ez = moved[0], moved[1], moved[2]
+    dx = ex + time * (a[0, 0] * ex + a[0, 1] * ey + a[0, 2] * ez + shift[0])
+    dy = ey + time * (a[1, 0] * ex + a[1, 1] * ey + a[1, 2] * ez + shift[1])
+    dz = ez + time * (a[2, 0] * ex + a[2, 1] * ey + a[2, 2] * ez + shift[2])
+    return x, y, z, dx, dy, dz
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, inline="always", fastmath=True, error_model="numpy")
 def time_at(times, x, y):  # type: ignore[no-untyped-def]
     """When the pixel nearest to (x, y) is exposed; beyond the image that at its border [s]."""
     height, width = times.shape
