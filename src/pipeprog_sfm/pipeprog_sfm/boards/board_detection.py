@@ -82,6 +82,23 @@ def detect_boards(ellipses: ImageEllipses, boards: Sequence[Board], camera: Came
     return found
 
 
+def observed_in(
+    ellipses: ImageEllipses, found: BoardObservation, before: ImageEllipses, camera: Camera
+) -> BoardObservation:
+    """A board that was found among ellipses of before, which have moved a little: the same circles, where they are now.
+
+    Args:
+        ellipses: the ellipses now, in the order of before.
+        found: what was found before.
+        before: among which it was found.
+        camera: calibration.
+    """
+    members = (before.centres[:, None] == found.ellipse_centres[None]).all(axis=2).argmax(axis=0)
+    conics = ellipses.conics[members]
+    centres = circle_centre_images(conics, camera.matrix, found.camera_from_board[:3, 2])
+    return replace(found, centres=centres, ellipse_centres=ellipses.centres[members], conics=conics)
+
+
 def detect_predicted_board(
     ellipses: ImageEllipses, board: Board, camera: Camera, camera_from_board: FloatArray
 ) -> BoardObservation | None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import BoardObservation
-from pipeprog_sfm.boards.board_detection import detect_boards
+from pipeprog_sfm.boards.board_detection import detect_boards, observed_in
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.boards.ellipses import ImageEllipses, detect_ellipses
 from pipeprog_sfm.boards.placed_board import PlacedBoard
@@ -143,13 +143,17 @@ class MetricTracker:
         return posed if rolling is None else self._unrolled(posed, rolling)
 
     def _unrolled(self, posed: PosedEvidence, rolling: RollingViews) -> PosedEvidence:
-        """The same by ellipses as the middle row's camera has them."""
+        """The same by ellipses as the middle row's camera has them: boards are sought once, and follow from there."""
         detected: dict[int, tuple[ImageEllipses, list[BoardObservation]]] = {}
 
         def evidence(ellipses: Mapping[int, ImageEllipses]) -> PosedEvidence:
             for stamp, own in ellipses.items():
-                if stamp in rolling.motions and (stamp not in detected or detected[stamp][0] is not own):
-                    detected[stamp] = own, detect_boards(own, self._board_file.boards, self._cameras[stamp])
+                camera = self._cameras[stamp]
+                if stamp in detected:
+                    before, found = detected[stamp]
+                    detected[stamp] = own, [observed_in(own, board, before, camera) for board in found]
+                elif stamp in rolling.motions:
+                    detected[stamp] = own, detect_boards(own, self._board_file.boards, camera)
             observations = self._observations | {stamp: found for stamp, (_, found) in detected.items()}
             return replace(posed, seen=self._evidence(posed.camera, posed.poses, ellipses, observations))
 

@@ -9,7 +9,7 @@ from targets import BOARD, CAMERA, LOPSIDED, camera_from_board, exact_ellipses, 
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.boards.board import Board, symmetries
-from pipeprog_sfm.boards.board_detection import detect_boards, detect_predicted_board
+from pipeprog_sfm.boards.board_detection import detect_boards, detect_predicted_board, observed_in
 from pipeprog_sfm.boards.ellipses import ImageEllipses, detect_ellipses
 from pipeprog_sfm.config import BoardConfig
 
@@ -51,6 +51,21 @@ def test_lens_distortion_is_removed_before_the_fit():
     (found,) = detect_boards(detect_ellipses(render(BOARD, pose, camera), camera, CONFIG), [BOARD], camera)
     error = found.centres - images_of_centres(BOARD, pose)[found.indices]
     assert np.sqrt((error**2).sum(1).mean()) < CENTRE_TOLERANCE
+
+
+def test_a_board_is_followed_where_its_ellipses_move():
+    """By 3 px, as a rolling shutter moves them: the same circles as by detection, and centres as exact."""
+    rng = np.random.default_rng(0)
+    before, after = (camera_from_board((0.3 + aside, 0.1, 1.2), (0, 0, 0), roll=0.1) for aside in (0.0, 0.0072))
+    others = clutter(rng, 20)
+    ellipses, moved = (joined(exact_ellipses([BOARD], [pose]), others) for pose in (before, after))
+    (found,) = detect_boards(ellipses, [BOARD], CAMERA)
+    (expected,) = detect_boards(moved, [BOARD], CAMERA)
+    followed = observed_in(moved, found, ellipses, CAMERA)
+    np.testing.assert_array_equal(followed.indices, expected.indices)
+    np.testing.assert_array_equal(followed.ellipse_centres, expected.ellipse_centres)
+    np.testing.assert_array_equal(followed.conics, expected.conics)
+    np.testing.assert_allclose(followed.centres, images_of_centres(BOARD, after), atol=0.01)
 
 
 def test_no_ellipses_in_flat_and_noisy_images():
