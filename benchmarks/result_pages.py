@@ -188,6 +188,7 @@ PAGES = {
     ),
     "cost": Page("Time and memory of the detector", ("cost",)),
     "map_growth": Page("Time of a keyframe as the map grows", ("map_growth",)),
+    "descriptors": Page("SIFT descriptors beside OpenCV's", ("descriptors",)),
     "selector_cost": Page("Time of choosing keyframes", ("selector_cost",)),
     "stream_memory": Page("Memory of the frame selector", ("stream_memory",)),
     "keyframe_path": Page("The camera's path from keyframes and from all frames", ("keyframe_path",)),

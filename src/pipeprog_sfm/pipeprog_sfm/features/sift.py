@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import MapperConfig
+from pipeprog_sfm.features.sift_descriptors import LAYERS, SIGMA, describe
 
 PIXELS = 600_000  # above, the image is halved: finer detail is mostly noise, and SIFT doubles the resolution itself
-CONTRAST = 0.004  # of the grey range; divided by 3 layers it is a third of a grey level, as bare painted walls have
+CONTRAST = 0.004  # of the grey range; divided by LAYERS it is a third of a grey level, as bare painted walls have
 TILES = (16, 9)  # features are ranked within tiles, so that weakly textured regions of the image are represented
 
 
@@ -39,16 +40,15 @@ def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Fe
     """
     factor = 0.5 if gray.size > PIXELS else 1.0
     small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else gray
-    sift = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=CONTRAST, sigma=SIGMA, enable_precise_upscale=True)
     found = sift.detect(small, None)
     if not found:
         return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8))
     places = np.array([keypoint.pt for keypoint in found], np.float32)
     response = np.array([keypoint.response for keypoint in found])
     chosen = _spread(places, response, small.shape)[: config.max_features]
-    kept, descriptors = sift.compute(small, [found[index] for index in chosen])
-    places = np.array([keypoint.pt for keypoint in kept], np.float32)
-    pixels = (places + 0.5) / factor - 0.5
+    descriptors = describe(small, [found[index] for index in chosen])
+    pixels = (places[chosen] + 0.5) / factor - 0.5
     keypoints = camera.undistort_points(pixels).astype(np.float32)
     # Far outside of a lens's image circle its distortion has no inverse.
     known = np.isfinite(keypoints).all(axis=1)
