@@ -13,7 +13,7 @@ from pipeprog_detect.silhouette.apparent_contour import contour_samples
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.thin import false_lines
-from pipeprog_detect.thin.false_lines import LEAST_POINTS, is_bare, is_false_line, is_one_step, is_strip_of_light
+from pipeprog_detect.thin.false_lines import is_bare, is_false_line, is_one_step, is_strip_of_light
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, WALL, wall_points
 from tests.unit.detect.straight_ahead import looking_along_y
@@ -111,11 +111,14 @@ def test_texture_goes_on_within_a_shadow_and_not_within_a_pipe(inside: float | N
 
 
 @pytest.mark.parametrize("before", [0.05, 0.3])
-def test_a_line_is_bare_where_the_cloud_shows_what_is_around_it_alone(before: float) -> None:
+@pytest.mark.parametrize(("shown", "stands"), [(0.0, False), (0.1, False), (0.3, True), (0.8, True)])
+def test_a_line_is_bare_where_the_cloud_shows_what_is_around_it_alone(
+    before: float, shown: float, stands: bool
+) -> None:
     line = Cylinder(np.array([-0.5, WALL - before, 0.0]), np.array([0.5, WALL - before, 0.0]), 0.0086)
     wall = wall_points().astype(np.float32)
-    assert is_bare(line, wall) is (before < 0.15)  # farther away the wall does not tell whether stereo would show it
-    along = np.linspace(-0.4, 0.4, int(LEAST_POINTS))[:, None]
+    along = np.arange(-0.5, -0.5 + shown, 0.02)[:, None]
     barrel = (line.middle + along * line.axis + [0.0, -line.radius, 0.0]).astype(np.float32)
-    assert not is_bare(line, np.concatenate([wall, barrel]))
+    # Farther away the wall does not tell whether stereo would show it.
+    assert is_bare(line, np.concatenate([wall, barrel])) is (before < 0.15 and not stands)
     assert not is_bare(line, wall[:: len(wall) // 20])
