@@ -131,6 +131,7 @@ class CandidateFitter:
 
         None where the cloud allows none, or where the keyframes do not tell it from the next planned one. The surface
         that the cloud shows and the side that is seen tell the radius together.
+        Stereo makes an arc too flat, never too narrow: a thinner planned radius may be farther from the cloud's.
         Where the cloud resolves the section any support that makes a fit suffices. Where it does not, or the radius
         was given to it, more than half of the contour must be supported, where the surface allows it.
         """
@@ -139,7 +140,7 @@ class CandidateFitter:
         ranked = []
         for planned in self._radii():
             misfit = (planned - radius) / sigma
-            if abs(misfit) < REACH and abs(planned / radius - 1.0) < NEAR_PLANNED:
+            if abs(misfit) < REACH and planned / radius - 1.0 < NEAR_PLANNED:
                 surface = _with_surface(candidate, planned, views, others)
                 fit = _of_one_side(candidate, surface, views, others)
                 if fit is not None:

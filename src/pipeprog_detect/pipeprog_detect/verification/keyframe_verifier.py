@@ -12,6 +12,7 @@ from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
+from pipeprog_detect.silhouette.extension import LEAST_STUB
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
@@ -24,8 +25,6 @@ from pipeprog_detect.verification.radius_agreement import agree, contradict, is_
 FEW_VIEWS = 30
 # Points along an axis by which the views that show it are found.
 AXIS_POINTS = 9
-# A piece of a pipe is at least as long as it is wide, in radii: shorter ones are edges of what the views see through.
-SHORTEST_PIECE = 2.0
 # A candidate is verified once: another one within this share of its radius and length gets the same answer.
 SAME = 0.1
 
@@ -111,7 +110,7 @@ class KeyframeVerifier:
         bounds = [0.0, *(end for stretch in free for end in stretch), whole.length]
         pieces = []
         for low, high in zip(bounds[::2], bounds[1::2], strict=True):
-            if high - low > SHORTEST_PIECE * whole.radius:
+            if high - low > LEAST_STUB * whole.radius:
                 share = (high - low) / whole.length
                 points = int(share * measured.candidate.points)
                 candidate = replace(measured.candidate, cylinder=whole.cut(low, high), points=points)
@@ -124,13 +123,15 @@ class KeyframeVerifier:
         """The pipe that cloud and keyframes make of a candidate; None where they make none.
 
         A candidate whose contour is not seen stays as the cloud has it only where it is trusted and, beside keyframes
-        that should have shown it, resolved by the cloud.
+        that should have shown it, resolved by the cloud. One that is not trusted, and whose contour has no planned
+        radius, may show one side alone, or be too thick in the cloud for its own edges to be within the search.
         """
         if not self.has_views:
             return MeasuredPipe.of_cloud(candidate) if trusted else None
         fit = self._fitter.fit(candidate, others, self._views, trusted=trusted)
-        if fit is None and not trusted and (candidate.radius_held or not candidate.blurred):
-            fit = self._fitter.of_visible_side(candidate, others, self._views)
+        is_planned = fit is not None and self._fitter.is_planned(fit)
+        if not is_planned and not trusted and (candidate.radius_held or not candidate.blurred):
+            fit = self._fitter.of_visible_side(candidate, others, self._views) or fit
         if fit is None and not (trusted and is_resolved(candidate)):
             return None
         if candidate.blurred or not trusted:

@@ -132,6 +132,30 @@ def test_of_a_pipe_in_a_rack_one_side_suffices(
     assert [each.cylinder for each in verifier.measure([rough], [False])] == [fit.cylinder] * stands
 
 
+@pytest.mark.parametrize(("found", "stands"), [(0.0682, True), (0.0575, False)])
+def test_of_an_arc_that_led_to_no_planned_radius_one_side_is_tried(
+    monkeypatch: pytest.MonkeyPatch, found: float, stands: bool
+) -> None:
+    """A DN100 under a ceiling, of which stereo spreads the ends of 115 deg: 19 % too thick, at 2.97 times its sigma.
+
+    Its own edges were not within the search from there; where they are found, they are what tells.
+    """
+    evidence = CloudEvidence(np.radians(115.0), 0.98, 0.0, 0.00166, 0.0, 26.0)
+    rough = Candidate(replace(PIPE, radius=0.0685), 0.00094, 30_000, evidence)
+    free, one_side = (
+        ContourFit(
+            replace(PIPE, radius=radius), np.eye(3)[1:], np.eye(5), 2e-4, support, 90.0, 20, (0.0, 0.0), 0.0, 0.5
+        )
+        for radius, support in ((found, 0.55), (0.0575, 0.78))
+    )
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: free)
+    monkeypatch.setattr(candidate_fit, "_at_radius", lambda *_: None)
+    monkeypatch.setattr(candidate_fit, "_of_one_side", lambda *_: one_side)
+    monkeypatch.setattr(candidate_fit, "_with_surface", lambda *_: one_side.cylinder)
+    measured = KeyframeVerifier([looking_along_y(0.0, 0)], _boq(0.0575)).measure([rough], [False])
+    assert [each.fit is one_side for each in measured] == [stands]
+
+
 @pytest.mark.parametrize(("noise", "stands"), [(0.0004, True), (0.004, False)])
 def test_one_side_verifies_what_the_cloud_resolves(monkeypatch: pytest.MonkeyPatch, noise: float, stands: bool) -> None:
     """A DN200 between two elbows at the lower border of the images: 75 deg of arc, and its upper side."""
