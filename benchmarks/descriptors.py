@@ -26,14 +26,15 @@ from sensor_msgs.msg import CompressedImage
 from benchmarks.recordings import made, named
 from benchmarks.survey import commit
 from pipeprog_bringup.recording.bag import Bag
+from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.matching import match
-from pipeprog_sfm.features.sift import CONTRAST, PIXELS, root_sift
-from pipeprog_sfm.features.sift_descriptors import LAYERS, SIGMA, describe
+from pipeprog_sfm.features.sift import keypoint_search, root_sift, working_image
+from pipeprog_sfm.features.sift_descriptors import describe
 
 RESULTS = Path(__file__).parent / "results" / "descriptors.json"
 TITLE = "SIFT descriptors: ours beside OpenCV's, of the same keypoints"
 FRAMES = 16  # of a recording
-FEATURES = 4000  # of a frame, the strongest
+FEATURES = MapperConfig().max_features  # of a frame, the strongest
 ROUNDS = 3  # the least of them counts: other work on the machine only adds
 NEAR = 1.0  # px, from the epipolar line
 
@@ -54,11 +55,9 @@ def main(names: Sequence[str]) -> None:
 
 
 def _measure(path: Path) -> list[dict[str, Any]]:
-    bag = Bag.open(path)
-    messages = list(bag)
-    factor = 0.5 if bag.camera.width * bag.camera.height > PIXELS else 1.0
-    images = [_image(message.data, factor) for message in messages[:: max(len(messages) // FRAMES, 1)][:FRAMES]]
-    sift = cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=CONTRAST, sigma=SIGMA, enable_precise_upscale=True)
+    messages = list(Bag.open(path))
+    images = [_image(message.data) for message in messages[:: max(len(messages) // FRAMES, 1)][:FRAMES]]
+    sift = keypoint_search()
     found = [sorted(sift.detect(image, None), key=lambda point: -point.response)[:FEATURES] for image in images]
     rows: list[dict[str, Any]] = []
     peer = 0.0  # ms a frame
@@ -83,11 +82,11 @@ def _measure(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _image(message: bytes, factor: float) -> NDArray[np.uint8]:
+def _image(message: bytes) -> NDArray[np.uint8]:
     data = np.frombuffer(bytes(deserialize_message(message, CompressedImage).data), np.uint8)
     gray = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
     assert gray is not None
-    return np.asarray(cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
+    return working_image(gray.astype(np.uint8, copy=False))[0]
 
 
 def _seconds(way: Described, images: Sequence[NDArray[np.uint8]], found: Sequence[Keypoints]) -> float:

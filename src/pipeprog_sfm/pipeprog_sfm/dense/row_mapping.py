@@ -26,7 +26,6 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage, row_of, shown_at
 from pipeprog_sfm.dense.depth_sampling import depth_at
 
-_ROW_STEPS = 1  # after the first, from the row at the stamp to the one that shows a point: 0.01 px are left
 # Steps from a pixel at the stamp to where the image shows it: the depth is looked up anew in each.
 _STEPS = 3
 # The last step moves a pixel by less than this [px], or the pixel is hidden at the stamp: a contour lies between.
@@ -124,7 +123,8 @@ def at_row(homography, epipole, rows, n, u, v, turned, moved):  # type: ignore[n
 def at_other_row(turned, moved, rows, n, inverse):  # type: ignore[no-untyped-def]
     """Homogeneous pixel (3) of neighbour n, at the time of its own row, and its derivative (3) by the inverse depth.
 
-    `turned` and `moved` (3,) are from `at_row`; the derivative is up to the square of the turn.
+    `turned` and `moved` (3,) are from `at_row`; the derivative is up to the square of the turn. The row is found in one
+    step from that of the stamp, which leaves 0.01 px.
     """
     a, b, shift = rows.other_turned[n, 0], rows.other_turned[n, 1], rows.other_moved[n]
     px, py, pz = turned[0] + inverse * moved[0], turned[1] + inverse * moved[1], turned[2] + inverse * moved[2]

@@ -38,10 +38,8 @@ def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Fe
 
     RootSIFT (Arandjelovic and Zisserman, CVPR 2012).
     """
-    factor = 0.5 if gray.size > PIXELS else 1.0
-    small = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else gray
-    sift = cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=CONTRAST, sigma=SIGMA, enable_precise_upscale=True)
-    found = sift.detect(small, None)
+    small, factor = working_image(gray)
+    found = keypoint_search().detect(small, None)
     if not found:
         return Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8))
     places = np.array([keypoint.pt for keypoint in found], np.float32)
@@ -53,6 +51,18 @@ def extract(gray: NDArray[np.uint8], camera: Camera, config: MapperConfig) -> Fe
     # Far outside of a lens's image circle its distortion has no inverse.
     known = np.isfinite(keypoints).all(axis=1)
     return Features(keypoints[known], root_sift(descriptors[known]))
+
+
+def working_image(gray: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
+    """The image (H, W) uint8 that is searched, halved where it has more than PIXELS, and its scale."""
+    if gray.size <= PIXELS:
+        return gray, 1.0
+    return np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8), 0.5
+
+
+def keypoint_search() -> cv2.SIFT:
+    """OpenCV's search, in the scale space in which `describe` describes."""
+    return cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=CONTRAST, sigma=SIGMA, enable_precise_upscale=True)
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

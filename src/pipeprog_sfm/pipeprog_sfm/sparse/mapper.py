@@ -34,7 +34,7 @@ REMEMBERED = 100  # retired keyframes whose features are kept in case they are a
 # Of a keyframe that comes between two of a rolling shutter's which show the same: it is there for the velocities. These
 # points tell its pose to 0.3 mm, and a velocity over 0.4 s to 1 mm/s, by which no row moves by more than 0.01 mm.
 MOTION_FEATURES = 1000
-MOST = 0.5  # of the points of the one of two views that has fewer
+ALIKE = 0.5  # of the points of the one of two views that has fewer, from which on they show the same
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,12 @@ class Mapper:
     def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe: (H, W) uint8 as the camera saw it, stamp in ns; features of a retired one are reused."""
         known = self._retired.pop(stamp, None)
+        if known is not None:
+            return self.add_features(stamp, known.measured_features(), camera, frame)
         config = self._config
         if self.map.readout and self._is_seen_around(stamp, frame):
             config = replace(config, max_features=min(config.max_features, MOTION_FEATURES))
-        features = known.measured_features() if known else self._extract(gray, camera, config)
-        return self.add_features(stamp, features, camera, frame)
+        return self.add_features(stamp, self._extract(gray, camera, config), camera, frame)
 
     def add_features(self, stamp: int, features: Features, camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe whose features are known; frame: of its camera."""
@@ -221,7 +222,7 @@ class Mapper:
             return False
         around = model.stamps.index(max(before)), model.stamps.index(min(after))
         held = min(len(model.seen(view)) for view in around)
-        return bool(model.covisible(around[0])[around[1]] > MOST * held)
+        return bool(model.covisible(around[0])[around[1]] > ALIKE * held)
 
     def _neighbours(self, model: SparseModel, keyframe: Keyframe) -> IntArray:
         """The two views of its camera nearest in time, and the nearest one of each other camera of a rig."""
