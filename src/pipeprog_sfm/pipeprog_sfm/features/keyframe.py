@@ -31,6 +31,7 @@ class Keyframe:
         cells: of the grid over the image that hold a feature.
         measured: (N, 2) keypoints as they were found, with the rows' own times.
         frame: of the camera.
+        motion: with which the features were unrolled; None where they are as measured.
     """
 
     stamp: int
@@ -42,6 +43,7 @@ class Keyframe:
     cells: int
     measured: NDArray[np.float32]
     frame: str = ""
+    motion: RowMotion | None = None
 
     @staticmethod
     def of(stamp: int, features: Features, camera: Camera, frame: str = "") -> Keyframe:
@@ -58,7 +60,8 @@ class Keyframe:
         """
         keypoints = motion.unrolled_pixels(self.measured, depths, self.camera)
         rays = (keypoints - [self.camera.cx, self.camera.cy]) / self.focal
-        return replace(self, features=replace(self.features, keypoints=keypoints.astype(np.float32)), rays=rays)
+        features = replace(self.features, keypoints=keypoints.astype(np.float32))
+        return replace(self, features=features, rays=rays, motion=motion)
 
     def measured_features(self) -> Features:
         """The features as they were found."""

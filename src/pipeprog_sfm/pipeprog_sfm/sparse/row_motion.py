@@ -4,8 +4,8 @@
 The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
 are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
 (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). The ends of the
-trajectory, where a spline is poor, are corrected by what their own rows tell beside points that many views hold, and
-so is what is predicted of a new view.
+trajectory, where a spline is poor, are corrected by what their own rows tell beside points that many views hold. So
+are the few views whose rows contradict it, as where a walk turns a corner, and so is what is predicted of a new view.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
@@ -16,40 +16,44 @@ the read-out is 15 ms: three turns do.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Container, Mapping, MutableMapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import make_interp_spline
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, rotation_from_vector
+from pipeprog_sfm.sparse.row_fit import RowFit, fit_rows
 from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 MAX_GAP = 1.0  # s between two views that still tell the velocity between them: a hand sways at 1 to 2 Hz
 MIN_GAP = 0.02  # s between two knots: poses are known to 0.3 mm, and their difference over it to 0.02 m/s
-NEAR = 16  # views nearest in time that tell how one moves: a knot has a quarter of the say of the one before
+NEAR = 16  # views nearest in time that tell how one moves: a knot has 0.43 of the say of the one before, see DECAY
 # rad/s and depths of the scene per second, for each second to the next pose: how far the velocity at an end of the
 # spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
 END_CHANGE = 1.0
-# Knots of a cubic spline from an end inwards that its condition moves, each 2 - sqrt(3) times as much as the one
-# before; of the fourth it is a fiftieth.
-END_KNOTS, DECAY = 3, 2.0 - np.sqrt(3.0)
+# Of the spline. A hand sways at up to 1.7 Hz: through poses 0.2 s apart, a cubic one has such a velocity 21 % too low
+# (1 - 3 sin(w) / (2 + cos(w)) / w with w = 2 pi 1.7 0.2), one of degree 5 has it 6 % too low.
+DEGREE = 5
+# Knots of such a spline from an end inwards that its condition moves, each 0.43 times as much as the one before; of the
+# fifth it is a thirtieth.
+END_KNOTS, DECAY = 4, 0.43
 # Views of a trajectory from which all of these follow their own rows, a quarter of it at most: of nine, six that do
 # bend the scene. In a shorter one, and in a window of the nearest views, the outermost alone do.
-LONG_TRAJECTORY = 24
+LONG_TRAJECTORY = 4 * 2 * END_KNOTS
+# Standard deviations, from the views of the trajectory, by which a view's rows differ from the spline where it is taken
+# to be wrong: with six numbers of each of 100 views, by chance in one trajectory of 25.
+CONTRADICTED = 4.0
+NORMAL_SPREAD = 1.4826  # standard deviations of a normal distribution in its median absolute deviation
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
-MAX_STEPS = 10  # of Gauss-Newton: it converges in three to six
-CONVERGED = 0.01  # px, root mean square of a step over the points, a thirtieth of their noise
 # Views of a point that tells how one of them moves: with fewer, that view has too much say in where the point is, and
 # the point follows the view's own error.
 LONG_TRACK = 6
-MIN_POINTS = 50  # of a view, from which its own rows tell its velocity: twelve unknowns, and some wrong points
 
 
 def row_motions(
@@ -70,26 +74,15 @@ def row_motions(
     for view in views.tolist():
         keyframe = keyframes[model.stamps[view]]
         by_camera[keyframe.frame, keyframe.camera].append(view)
-    centres = model.centres()
+    long_tracks = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points)) >= LONG_TRACK
     found: dict[int, RowMotion] = {}
     for members in by_camera.values():
         order = np.array(sorted(members, key=model.stamps.__getitem__))
         stamps = np.array([model.stamps[view] for view in order], np.int64)
         ends = np.flatnonzero(np.diff(stamps) > MAX_GAP * 1e9) + 1
         for part in np.split(order, ends):
-            own = [model.stamps[view] for view in part]
-            linear, angular = _velocities(own, model.rotation[part], centres[part])
-            gaps = np.diff(own, prepend=own[0], append=own[-1]) * 1e-9
-            for number, (shift, turn) in enumerate(zip(linear, angular, strict=True)):
-                if part[number] not in wanted:
-                    continue
-                keyframe = keyframes[own[number]]
-                motion = RowMotion(readout, keyframe.camera.height, shift, turn)
-                inwards = min(number, len(own) - 1 - number)
-                if inwards < (END_KNOTS if near is None and len(own) >= LONG_TRAJECTORY else 1):
-                    sigma = END_CHANGE * DECAY**inwards * max(gaps[number], gaps[number + 1])
-                    motion = _fitted(model, int(part[number]), keyframe, motion, sigma)
-                found[own[number]] = motion
+            is_long = near is None and len(part) >= LONG_TRAJECTORY
+            found |= _along(model, part, keyframes, readout, wanted, long_tracks, is_long)
     return found
 
 
@@ -173,7 +166,7 @@ def told_by_rows(
     """
     gap = int(np.abs(np.array(model.stamps) - keyframe.stamp).min()) * 1e-9
     inside = model.points[pairs[:, 1]] @ camera_from_model[:3, :3].T + camera_from_model[:3, 3]
-    return _fitted_to(inside, keyframe, pairs[:, 0], model.noise, motion, END_CHANGE * gap)
+    return fit_rows(inside, keyframe, pairs[:, 0], model.noise, motion, END_CHANGE * gap).motion
 
 
 def near_in_time(model: SparseModel, stamp: int) -> IntArray:
@@ -192,57 +185,55 @@ def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatAr
     return np.asarray(depths[depths > 0][tree.query(keyframe.measured)[1]])
 
 
-def _fitted(model: SparseModel, view: int, keyframe: Keyframe, motion: RowMotion, sigma: float) -> RowMotion:
-    """The motion that fits the view's points best, with that of the spline as the prior and the pose as it may be.
+def _along(
+    model: SparseModel,
+    views: IntArray,
+    keyframes: Mapping[int, Keyframe],
+    readout: float,
+    wanted: Container[int],
+    long_tracks: NDArray[np.bool_],
+    is_long: bool,
+) -> dict[int, RowMotion]:
+    """As `row_motions`, for views of one camera in order of time, without long gaps between them.
 
-    sigma: standard deviation of the spline's velocities, rad/s, and depths of the scene per second. Gauss-Newton steps
-    for pose and velocity, twelve unknowns: the columns of the velocity are those of the pose times the row's time.
-    Where the spline is off by much, its rows are too, and count little by their robust weights: one step is not enough.
+    wanted: views whose motions are asked for; long_tracks (P,): points with LONG_TRACK views; is_long: whether some at
+    each end and those that contradict the spline follow their own rows, and not the outermost ones alone.
     """
-    views = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points))
-    own = model.point_of[model.features(view)]
-    features = np.flatnonzero((own >= 0) & (views[own] >= LONG_TRACK))
-    inside = model.points[own[features]] @ model.rotation[view].T
-    inside += model.translation[view]
-    return _fitted_to(inside, keyframe, features, model.noise, motion, sigma)
+    stamps = [model.stamps[view] for view in views]
+    velocities = _velocities(stamps, model.rotation[views], model.centres()[views])
+    gaps = np.diff(stamps, prepend=stamps[0], append=stamps[-1]) * 1e-9
+    sigmas = END_CHANGE * np.maximum(gaps[:-1], gaps[1:])
+    motions: dict[int, RowMotion] = {}
+    inner: dict[int, RowFit] = {}
+    for number, (linear, angular) in enumerate(zip(*velocities, strict=True)):
+        stamp, view = stamps[number], int(views[number])
+        if view not in wanted:
+            continue
+        keyframe = keyframes[stamp]
+        motions[stamp] = motion = RowMotion(readout, keyframe.camera.height, linear, angular)
+        inwards = min(number, len(views) - 1 - number)
+        at_end = inwards < (END_KNOTS if is_long else 1)
+        if not at_end and not is_long:
+            continue
+        own = model.point_of[model.features(view)]
+        features = np.flatnonzero((own >= 0) & long_tracks[own])
+        inside = model.points[own[features]] @ model.rotation[view].T + model.translation[view]
+        sigma = sigmas[number] * (DECAY**inwards if at_end else 1.0)
+        fit = fit_rows(inside, keyframe, features, model.noise, motion, sigma)
+        if at_end:
+            motions[stamp] = fit.motion
+        else:
+            inner[stamp] = fit
+    wrong = _contradicted(list(inner.values()))
+    return motions | {
+        stamp: fit.motion for (stamp, fit), is_wrong in zip(inner.items(), wrong, strict=True) if is_wrong
+    }
 
 
-def _fitted_to(
-    inside: FloatArray, keyframe: Keyframe, features: IntArray, noise: float, motion: RowMotion, sigma: float
-) -> RowMotion:
-    """As `_fitted`, for points (K, 3) in the camera's frame that the features (K,) of a keyframe show."""
-    ahead = inside[:, 2] > 0
-    features, inside = features[ahead], inside[ahead]
-    if len(features) < MIN_POINTS:
-        return motion
-    camera = keyframe.camera
-    measured = keyframe.measured[features].astype(np.float64)
-    times = motion.row_times(camera.distort_points(measured)[:, 1])[:, None, None]
-    precision = 1.0 / (sigma * np.repeat([1.0, float(np.median(inside[:, 2]))], 3)) ** 2
-    moved = np.zeros(6)  # from the spline's velocities
-    fitted = motion
-    for _ in range(MAX_STEPS):
-        x, y, z = inside.T
-        shown = np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
-        error = fitted.unrolled_pixels(measured, z, camera) - shown
-        by_point = np.zeros((len(z), 2, 3))
-        by_point[:, 0, 0], by_point[:, 1, 1] = camera.fx / z, camera.fy / z
-        by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
-        by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
-        rows = np.concatenate([by_pose, times * by_pose], axis=2).reshape(-1, 12)
-        weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * noise) ** 2) / noise**2
-        weighted = (np.repeat(weights, 2)[:, None] * rows).T
-        normal = weighted @ rows
-        normal[np.arange(6, 12), np.arange(6, 12)] += precision
-        pull = weighted @ error.ravel()
-        pull[6:] -= precision * moved
-        change = np.linalg.solve(normal, pull)
-        inside = inside @ rotation_from_vector(change[None, :3])[0].T + change[3:6]
-        moved += change[6:]
-        fitted = replace(motion, angular=motion.angular + moved[:3], linear=motion.linear + moved[3:])
-        if np.sqrt(2.0 * ((rows @ change) ** 2).mean()) < CONVERGED:
-            break
-    return fitted
+def _contradicted(fits: list[RowFit]) -> NDArray[np.bool_]:
+    """(N,) whether the rows of a view contradict its prior more than those of most others do."""
+    apart = np.abs([fit.moved / fit.sigmas for fit in fits]).reshape(-1, 6)
+    return (apart > CONTRADICTED * NORMAL_SPREAD * np.median(apart, axis=0)).any(axis=1) if fits else np.empty(0, bool)
 
 
 def _velocities(stamps: list[int], rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -255,8 +246,10 @@ def _velocities(stamps: list[int], rotations: FloatArray, centres: FloatArray) -
     if len(knots) < 2:
         return np.empty((0, 3)), np.empty((0, 3))
     turns = _unit_quaternions(rotations.transpose(0, 2, 1))
-    # Without acceleration at the ends: a spline whose ends are free doubles the error of its last velocities.
-    spline = CubicSpline(times[knots], np.c_[centres, turns][knots], bc_type="natural")
+    degree = DEGREE if len(knots) > 2 else 3  # two poses tell a line
+    # A natural spline: one whose ends are free doubles the error of its last velocities.
+    ends = [(order, np.zeros(7)) for order in range((degree + 1) // 2, degree)]
+    spline = make_interp_spline(times[knots], np.c_[centres, turns][knots], k=degree, bc_type=(ends, ends))
     rate = spline(times, 1)
     # q' = q w / 2 with the angular velocity w in the camera's frame; what is along q changes its length alone.
     own_turn = 2.0 * (Rotation.from_quat(turns).inv().as_matrix() @ _imaginary(turns, rate[:, 3:])[..., None])[..., 0]

@@ -123,7 +123,7 @@ class SparseMap:
         for model in self.models:
             for view, stamp in enumerate(model.stamps):
                 model.replace_camera(view, self.keyframes[stamp].rays, self.keyframes[stamp].focal)
-            unroll(model, self.keyframes, self.motions(model))
+            self._unroll(model)
             adjust_points(model)
             if camera != told:  # with another read-out alone, the poses refined with it are near enough for the tracks
                 self.adjust_globally(model, MAX_TURNS)
@@ -135,15 +135,21 @@ class SparseMap:
     def motions(self, model: SparseModel, readout: float | None = None) -> dict[int, RowMotion]:
         """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout.
 
-        readout: s, another one than the map's.
+        These are the motions that its features were unrolled with; with a `readout` [s], those by that one.
         """
-        readout = self.readout if readout is None else readout
-        return row_motions(model, self.keyframes, readout) if readout else {}
+        if readout is not None:
+            return row_motions(model, self.keyframes, readout) if readout else {}
+        used = {stamp: self.keyframes[stamp].motion for stamp in model.stamps}
+        return {stamp: motion for stamp, motion in used.items() if motion is not None}
+
+    def _unroll(self, model: SparseModel) -> float:
+        """Shifts the features of a model by how it moves now; see `unroll`."""
+        return unroll(model, self.keyframes, self.motions(model, self.readout))
 
     def _adjust_rolling(self, model: SparseModel, turns: int) -> None:
         """Finds the shifts of features and the poses in turns, until the shifts stay."""
         for _ in range(turns):
-            change = unroll(model, self.keyframes, self.motions(model))
+            change = self._unroll(model)
             adjust_model(model)
             if change < SETTLED:
                 return

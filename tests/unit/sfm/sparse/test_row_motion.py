@@ -16,11 +16,13 @@ from scenes import CAMERA, STEP, pose, position_errors, view
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
+from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.registration import doubtful_views
-from pipeprog_sfm.sparse.row_motion import told_by_rows
+from pipeprog_sfm.sparse.row_motion import row_motions, told_by_rows
 from pipeprog_sfm.sparse.self_calibration import Priors
+from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 READOUT = 0.03  # s
 SPEED = 0.8  # m/s
@@ -38,6 +40,11 @@ def started_fast(time: float) -> NDArray[np.float64]:
     return pose(SPEED * time - 0.06 * np.exp(-time / 0.12), 0.1 * np.sin(2.5 * time))
 
 
+def turned(time: float) -> NDArray[np.float64]:
+    """camera_from_world of a walk that looks ahead by 0.25 rad from 3.1 s on, turning at up to 1.6 rad/s."""
+    return pose(SPEED * time, 0.125 * np.tanh((time - 3.1) / 0.08))
+
+
 def motion_at(time: float, path: Callable[[float], NDArray[np.float64]] = camera_at) -> RowMotion:
     before, now, after = (path(time + step) for step in (-TICK, 0.0, TICK))
     rate = (after - before) / (2 * TICK)
@@ -47,12 +54,12 @@ def motion_at(time: float, path: Callable[[float], NDArray[np.float64]] = camera
 
 
 def walk(
-    readout: float, path: Callable[[float], NDArray[np.float64]] = camera_at
+    readout: float, path: Callable[[float], NDArray[np.float64]] = camera_at, count: int = 9
 ) -> tuple[Mapper, dict[int, NDArray[Any]]]:
     """What a mapper makes of images with a read-out of 30 ms, when it is told one."""
     mapper = Mapper(MapperConfig(), readout=readout)
     truth = {}
-    for n in range(9):
+    for n in range(count):
         time = n * STEP * 1e-9
         truth[n * STEP] = path(time)
         mapper.add_features(n * STEP, view(truth[n * STEP], n, motion=motion_at(time, path)), CAMERA)
@@ -97,6 +104,34 @@ def test_a_fast_start_leaves_no_error() -> None:
     """The spline is off by 0.5 m/s there: what its own rows tell was too little while points followed its error."""
     mapper, truth = walk(READOUT, started_fast)
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 1e-3
+
+
+def test_views_of_a_sudden_turn_follow_their_own_rows() -> None:
+    """The spline is off by 0.3 rad/s there, and tells the views around another velocity."""
+    mapper, truth = walk(READOUT, turned, count=32)
+    model = mapper.map.published
+    motions = mapper.map.motions(model)
+    for number in (14, 15, 16, 17):
+        stamp = number * STEP
+        np.testing.assert_allclose(motions[stamp].angular, motion_at(stamp * 1e-9, turned).angular, atol=0.05)
+    assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
+
+
+def test_a_sway_between_two_poses_is_told() -> None:
+    """1.7 Hz, by poses 0.2 s apart: a cubic spline would have its velocity a fifth too low."""
+    model, keyframes = SparseModel(), {}
+    rate = 2.0 * np.pi * 1.7
+    for number in range(30):
+        features = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
+        keyframes[number * STEP] = Keyframe.of(number * STEP, features, CAMERA)
+        camera_from_world = pose(0.0, 0.01 * np.sin(rate * 0.2 * number))
+        camera_from_world[:3, 3] = 0.0
+        model.add_view(number * STEP, np.zeros((0, 2)), np.array([900.0, 900.0]), camera_from_world)
+    motions = row_motions(model, keyframes, READOUT)
+    inner = range(6, 24)  # the condition at an end moves the sixth knot by 0.43^6, half a percent
+    found = [motions[number * STEP].angular[1] for number in inner]
+    true = [-0.01 * rate * np.cos(rate * 0.2 * number) for number in inner]
+    np.testing.assert_allclose(found, true, atol=0.07 * 0.01 * rate)
 
 
 def test_a_view_that_holds_far_fewer_points_than_those_around_it_is_registered_anew() -> None:
