@@ -213,7 +213,7 @@ def _along(
         motions[stamp] = motion = RowMotion(readout, keyframe.camera.height, linear, angular)
         inwards = min(number, len(views) - 1 - number)
         at_end = inwards < (END_KNOTS if is_long else 1)
-        if not at_end and not is_long:
+        if readout == 0.0 or not (at_end or is_long):
             continue
         own = model.point_of[model.features(view)]
         features = np.flatnonzero((own >= 0) & long_tracks[own])
