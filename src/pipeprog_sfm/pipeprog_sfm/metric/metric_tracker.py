@@ -25,6 +25,10 @@ from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource, scale_bar_di
 from pipeprog_sfm.metric.transform_tree import Acceleration, RobotMotion, TransformTree
 from pipeprog_sfm.metric.unrolled_ellipses import RollingViews, unrolled_ellipses
 
+# px by which unrolled ellipses may move before boards are sought among them anew: circles of a board that can be read
+# are ten and more apart.
+FOLLOWED = 1.0
+
 
 class MetricTracker:
     """Holds the ellipses and detected boards of every keyframe, not the images, and what a robot told of its motion.
@@ -52,6 +56,7 @@ class MetricTracker:
         self._frames: dict[int, str] = {}
         self._ellipses: dict[int, ImageEllipses] = {}
         self._observations: dict[int, list[BoardObservation]] = {}
+        self._sought: dict[int, tuple[ImageEllipses, list[BoardObservation]]] = {}  # boards among unrolled ellipses
         self._transforms = TransformTree()
         self._accelerations: list[Acceleration] = []
 
@@ -86,6 +91,7 @@ class MetricTracker:
         for stamp in stamps:
             self._ellipses.pop(stamp, None)
             self._observations.pop(stamp, None)
+            self._sought.pop(stamp, None)
             self._frames.pop(stamp, None)
             self._cameras.pop(stamp, None)
 
@@ -143,18 +149,18 @@ class MetricTracker:
         return posed if rolling is None else self._unrolled(posed, rolling)
 
     def _unrolled(self, posed: PosedEvidence, rolling: RollingViews) -> PosedEvidence:
-        """The same by ellipses as the middle row's camera has them: boards are sought once, and follow from there."""
-        detected: dict[int, tuple[ImageEllipses, list[BoardObservation]]] = {}
+        """The same by ellipses as the middle row's camera has them: boards are sought again only where these moved."""
+
+        def found_in(stamp: int, ellipses: ImageEllipses) -> list[BoardObservation]:
+            camera = self._cameras[stamp]
+            before, found = self._sought.get(stamp, (None, []))
+            if before is None or np.abs(ellipses.centres - before.centres).max() > FOLLOWED:
+                before, found = self._sought[stamp] = ellipses, detect_boards(ellipses, self._board_file.boards, camera)
+            return [observed_in(ellipses, board, before, camera) for board in found]
 
         def evidence(ellipses: Mapping[int, ImageEllipses]) -> PosedEvidence:
-            for stamp, own in ellipses.items():
-                camera = self._cameras[stamp]
-                if stamp in detected:
-                    before, found = detected[stamp]
-                    detected[stamp] = own, [observed_in(own, board, before, camera) for board in found]
-                elif stamp in rolling.motions:
-                    detected[stamp] = own, detect_boards(own, self._board_file.boards, camera)
-            observations = self._observations | {stamp: found for stamp, (_, found) in detected.items()}
+            unrolled = {stamp: found_in(stamp, own) for stamp, own in ellipses.items() if stamp in rolling.motions}
+            observations = self._observations | unrolled
             return replace(posed, seen=self._evidence(posed.camera, posed.poses, ellipses, observations))
 
         def place(ellipses: Mapping[int, ImageEllipses]) -> tuple[Mapping[int, ImageEllipses], list[PlacedBoard]]:

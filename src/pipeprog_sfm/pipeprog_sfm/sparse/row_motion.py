@@ -177,12 +177,13 @@ def near_in_time(model: SparseModel, stamp: int) -> IntArray:
 def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatArray | None:
     """(N,) depths of a view's features: of their points, or of the nearest feature with one; None without any."""
     own = model.point_of[model.features(view)]
-    has = own >= 0
-    depths = model.points[own[has]] @ model.rotation[view, 2] + model.translation[view, 2]
-    if not (depths > 0).any():
+    depths = model.points[own] @ model.rotation[view, 2] + model.translation[view, 2]
+    has = (own >= 0) & (depths > 0)
+    if not has.any():
         return None
-    tree = cKDTree(keyframe.measured[has][depths > 0])
-    return np.asarray(depths[depths > 0][tree.query(keyframe.measured)[1]])
+    nearest = cKDTree(keyframe.measured[has]).query(keyframe.measured[~has])[1]
+    depths[~has] = depths[has][nearest]
+    return np.asarray(depths)
 
 
 def _along(
