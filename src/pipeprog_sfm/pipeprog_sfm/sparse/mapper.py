@@ -155,8 +155,10 @@ class Mapper:
 
     def finish(self) -> None:
         """Tries the waiting keyframes once more and adjusts everything."""
+        adjusted = []
         for model in self.map.models:
             self.map.adjust_globally(model, MAX_TURNS)
+            adjusted.append(list(model.stamps))
             for view in reversed(doubtful_views(model, self.map.keyframes) if self.map.readout else []):
                 if len(model) > 2:
                     self.map.put_back(model, view)
@@ -168,7 +170,8 @@ class Mapper:
         for stamp in [stamp for model in sorted(self.map.models, key=len)[:-1] for stamp in model.stamps]:
             self._retry_from(stamp, merge_models(self.map, self._localizer, stamp))
         for model in self.map.models:
-            self.map.adjust_globally(model)
+            if model.stamps not in adjusted:
+                self.map.adjust_globally(model)
 
     def _register_anywhere(self, keyframe: Keyframe) -> KeyframeReport:
         """By the neighbours in time; failing that, by views that look alike."""
