@@ -221,7 +221,8 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
     clear = [
         each
         for each in measured
-        if not around.is_embedded(each.cylinder, each.radius_sigma, viewing_direction(each.cylinder, views))
+        if not around.is_cut(each.cylinder, each.radius_sigma)
+        and not around.is_embedded(each.cylinder, each.radius_sigma, viewing_direction(each.cylinder, views))
     ]
     own = own_contours([each.cylinder for each in clear], views)
     return [each for each, is_own in zip(clear, own, strict=True) if is_own]

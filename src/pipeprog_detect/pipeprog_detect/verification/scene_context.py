@@ -35,6 +35,8 @@ _ASLANT, _LEAST_POINTS = 3.0, 3
 _TOLD = 0.25
 # A cylinder whose axis lies behind the wall, or before it by less than this share of the radius, is in it.
 _IN_WALL = 0.5
+# Share of a cylinder within which a wall may be seen: it may have been continued into one.
+_CUT = 0.25
 # Walls deviate from a plane by this much [m] over that width.
 _WAVINESS = 1e-3
 
@@ -104,7 +106,7 @@ class SceneContext:
         A plane is known by its normal and offset: what was seen of it may be far away.
         """
         on_one, on_other = (np.abs(points @ each.normal - each.offset) < self.clearance for each in (one, other))
-        return all(_are_along_half(cylinder, points[own]) for own in (on_one & ~on_other, on_other & ~on_one))
+        return all(_are_along(0.5, cylinder, points[own]) for own in (on_one & ~on_other, on_other & ~on_one))
 
     def is_embedded(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
         """Whether the cylinder, looked at along `towards` (3,), would lie within walls where these are seen beside it.
@@ -132,6 +134,17 @@ class SceneContext:
                 buried += all(np.median(flank) < surface for flank in flanks)
         return told >= _TOLD * bins and buried > 0.5 * told
 
+    def is_cut(self, cylinder: Cylinder, radius_sigma: float) -> bool:
+        """Whether a wall is seen within the cylinder, along more than `_CUT` of it: its surface would hide the wall.
+
+        So are cylinders that edges of ducts and boards were taken for.
+        """
+        inside = cylinder.radius - self._clear(radius_sigma)
+        if inside <= 0.0:
+            return False
+        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, inside)]
+        return _are_along(_CUT, cylinder, points[np.linalg.norm(cylinder.from_axis(points), axis=1) < inside])
+
     def touches_wall(self, cylinder: Cylinder) -> bool:
         """Whether a wall is as near to the axis as the radius, along more than half of the cylinder.
 
@@ -146,7 +159,7 @@ class SceneContext:
             if abs(plane.normal @ cylinder.axis) < ALONG:
                 from_points, from_axis = (np.abs(each @ plane.normal - plane.offset) for each in (points, foot))
                 touching |= (from_points < self.clearance) & (from_axis < nearest)
-        return _are_along_half(cylinder, points[touching])
+        return _are_along(0.5, cylinder, points[touching])
 
     @property
     def clearance(self) -> float:
@@ -172,9 +185,9 @@ def _reach_beside(cylinder: Cylinder) -> float:
     return float(cylinder.radius + max(_BESIDE * cylinder.radius, _LEAST_BESIDE))
 
 
-def _are_along_half(cylinder: Cylinder, points: FloatArray) -> bool:
-    """Whether points (N, 3) lie along more than half of a cylinder."""
+def _are_along(share: float, cylinder: Cylinder, points: FloatArray) -> bool:
+    """Whether points (N, 3) lie along more than a share of a cylinder."""
     along = cylinder.along(points)
     within = along[(along > 0.0) & (along < cylinder.length)]
     steps = max(int(cylinder.length / _STEP), 4)
-    return len(np.unique((within / cylinder.length * steps).astype(np.int64))) > 0.5 * steps
+    return len(np.unique((within / cylinder.length * steps).astype(np.int64))) > share * steps
