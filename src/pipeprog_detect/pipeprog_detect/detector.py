@@ -218,12 +218,12 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
     """Those that stand before the walls and whose outlines are no others', as far as there are views to tell."""
     if not views:
         return list(measured)
-    clear = [
-        each
-        for each in measured
-        if not around.is_cut(each.cylinder, each.radius_sigma)
-        and not around.is_embedded(each.cylinder, each.radius_sigma, viewing_direction(each.cylinder, views))
-    ]
+
+    def is_clear(each: MeasuredPipe) -> bool:
+        seen = each.cylinder, each.radius_sigma, viewing_direction(each.cylinder, views)
+        return not (around.is_covered(*seen) or around.is_embedded(*seen))
+
+    clear = [each for each in measured if is_clear(each)]
     own = own_contours([each.cylinder for each in clear], views)
     return [each for each, is_own in zip(clear, own, strict=True) if is_own]
 

@@ -35,8 +35,9 @@ _ASLANT, _LEAST_POINTS = 3.0, 3
 _TOLD = 0.25
 # A cylinder whose axis lies behind the wall, or before it by less than this share of the radius, is in it.
 _IN_WALL = 0.5
-# Share of a cylinder within which a wall may be seen: it may have been continued into one.
-_CUT = 0.25
+# Share of a cylinder within or before which a wall may be seen: it may have been continued into one. Walls farther than
+# this many radii from the axis are before the cylinder for some views and beside it for others.
+_COVERED, _CLOSE = 0.25, 2.0
 # Walls deviate from a plane by this much [m] over that width.
 _WAVINESS = 1e-3
 
@@ -134,16 +135,21 @@ class SceneContext:
                 buried += all(np.median(flank) < surface for flank in flanks)
         return told >= _TOLD * bins and buried > 0.5 * told
 
-    def is_cut(self, cylinder: Cylinder, radius_sigma: float) -> bool:
-        """Whether a wall is seen within the cylinder, along more than `_CUT` of it: its surface would hide the wall.
+    def is_covered(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
+        """Whether a wall is seen within the cylinder or close before it, looked at along `towards` (3,).
 
-        So are cylinders that edges of ducts and boards were taken for.
+        That is so along more than `_COVERED` of it. The surface of a pipe would hide a wall within it, and one before
+        it would hide the pipe: edges of ducts and boards were taken for its contour.
         """
-        inside = cylinder.radius - self._clear(radius_sigma)
-        if inside <= 0.0:
-            return False
-        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, inside)]
-        return _are_along(_CUT, cylinder, points[np.linalg.norm(cylinder.from_axis(points), axis=1) < inside])
+        sideways, depth = frame(cylinder, towards)
+        radius = cylinder.radius
+        clear = self._clear(radius_sigma)
+        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, _CLOSE * radius)]
+        offset = cylinder.from_axis(points)
+        aside, behind = offset @ sideways, offset @ depth
+        within = np.hypot(aside, behind) < radius - clear
+        before = (np.abs(aside) < radius - clear) & (behind < -np.sqrt(np.maximum(radius**2 - aside**2, 0.0)) - clear)
+        return _are_along(_COVERED, cylinder, points[within | before])
 
     def touches_wall(self, cylinder: Cylinder) -> bool:
         """Whether a wall is as near to the axis as the radius, along more than half of the cylinder.

@@ -68,20 +68,24 @@ def test_the_line_where_two_walls_meet_is_embedded_and_a_pipe_before_it_is_not()
     assert not corner.is_embedded(upright(-0.5 + RADIUS, -RADIUS), 1e-4, aslant)
 
 
-def test_a_wall_that_goes_through_a_pipe_cuts_it_and_one_that_touches_it_does_not() -> None:
+def test_a_wall_that_goes_through_a_pipe_or_before_it_covers_it_and_one_that_touches_it_does_not() -> None:
     """As the face of a duct, of which the edge was taken for a contour, and that of a wall that carries the pipe."""
     radius = 0.0579
     duct = surroundings(wall([-0.5, 0.0, 0.0], [0.04, 0.0, 1.0]))
-    assert duct.is_cut(upright(0.0, 0.051, radius), 3e-4)
-    assert not duct.is_embedded(upright(0.0, 0.051, radius), 3e-4, AWAY)
-    assert not duct.is_cut(upright(0.0, 0.051, radius), 4e-3)  # the radius may be too large
-    assert not surroundings(BACK).is_cut(upright(0.0, -radius, radius), 3e-4)
-    assert not surroundings(BACK).is_cut(upright(0.0, radius, radius), 3e-4)
+    for depth in (0.051, 0.067):
+        assert duct.is_covered(upright(0.0, depth, radius), 3e-4, AWAY)
+        assert not duct.is_embedded(upright(0.0, depth, radius), 3e-4, AWAY)
+    assert not surroundings(BACK).is_covered(upright(0.0, -radius, radius), 3e-4, AWAY)
 
 
-def test_a_pipe_that_goes_on_into_a_wall_is_not_cut() -> None:
+def test_a_wall_far_before_a_pipe_or_beside_it_does_not_cover_it() -> None:
+    assert not surroundings(BACK).is_covered(upright(0.0, 0.08, 0.0365), 1e-4, AWAY)
+    assert not surroundings(SIDE).is_covered(upright(-0.5 + 0.0365, -0.5, 0.0365), 1e-4, AWAY)
+
+
+def test_a_pipe_that_goes_on_into_a_wall_is_not_covered() -> None:
     across = Cylinder(np.array([0.0, -0.8, 0.5]), np.array([0.0, 0.1, 0.5]), 0.0365)
-    assert not surroundings(BACK).is_cut(across, 1e-4)
+    assert not surroundings(BACK).is_covered(across, 1e-4, np.array([1.0, 0.0, 0.0]))
 
 
 def test_a_wall_on_one_side_hides_one_side_only() -> None:
