@@ -47,6 +47,10 @@ class CandidateFitter:
         """Whether the fit has a radius of the bill of quantities, within its standard deviation."""
         return is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
 
+    def is_planned_in_cloud(self, candidate: Candidate) -> bool:
+        """Whether the cloud resolves the candidate's section and has a radius of the bill of quantities."""
+        return is_resolved(candidate) and is_planned(candidate.cylinder.radius, _sigma(candidate), self.boq)
+
     def fit(
         self,
         candidate: Candidate,

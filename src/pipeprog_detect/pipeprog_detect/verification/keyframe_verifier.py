@@ -123,8 +123,9 @@ class KeyframeVerifier:
         """The pipe that cloud and keyframes make of a candidate; None where they make none.
 
         A candidate whose contour is not seen stays as the cloud has it only where it is trusted and, beside keyframes
-        that should have shown it, resolved by the cloud. One that is not trusted, and whose contour has no planned
-        radius, may show one side alone, or be too thick in the cloud for its own edges to be within the search.
+        that should have shown it, resolved by the cloud. Then it keeps its radius as well if that is planned, and that
+        of a contour which is hardly seen is not. One that is not trusted, and whose contour has no planned radius, may
+        show one side alone, or be too thick in the cloud for its own edges to be within the search.
         """
         if not self.has_views:
             return MeasuredPipe.of_cloud(candidate) if trusted else None
@@ -151,7 +152,8 @@ class KeyframeVerifier:
             fit = self._fitter.near_planned(candidate, fit, others, self._views)
         if fit is None:
             return MeasuredPipe.of_cloud(candidate)
-        if not self._fitter.is_planned(fit) and contradict(candidate, fit):
+        is_weak = trusted and fit.support < CONVINCING and self._fitter.is_planned_in_cloud(candidate)
+        if not self._fitter.is_planned(fit) and (is_weak or contradict(candidate, fit)):
             return MeasuredPipe.between_ends_of(candidate, fit)
         return MeasuredPipe.of_contour(candidate, fit)
 

@@ -50,6 +50,22 @@ def test_a_blurred_candidate_whose_highlight_makes_a_contour_is_verified_at_a_pl
     assert not KeyframeVerifier(pipe_views, BOQ).verify(resolved)
 
 
+@pytest.mark.parametrize(("support", "share"), [(0.39, 0.99), (0.6, 0.92)])
+def test_a_contour_that_is_hardly_seen_does_not_overrule_the_planned_radius_of_the_cloud(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, support: float, share: float
+) -> None:
+    """Of a pipe in a rack, whose contour got an edge of its neighbour, 8 % too thin."""
+    thin = replace(PIPE, radius=0.92 * PIPE.radius)
+    contour = ContourFit(thin, np.eye(3)[1:], np.eye(5), 2e-4, support, 75.0, 20, (0.0, 0.0), 0.0, 0.5)
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: contour)
+    monkeypatch.setattr(CandidateFitter, "near_planned", lambda *_: contour)
+    cloud = Candidate(
+        replace(PIPE, radius=0.99 * PIPE.radius), 3e-4, 900, CloudEvidence(np.pi, 0.9, 0.0, 1e-3, 0.0, 300.0)
+    )
+    measured = KeyframeVerifier(pipe_views, BOQ).measure([cloud], [True])
+    assert [each.cylinder.radius for each in measured] == [share * PIPE.radius]
+
+
 def test_the_keyframes_measure_a_pipe_unless_contours_are_disabled(pipe_views: list[View]) -> None:
     points = np.concatenate([wall_points(), front_points(PIPE)])
     points = points + np.random.default_rng(3).normal(0.0, 1e-3, points.shape)
