@@ -30,6 +30,9 @@ LINES_CONVINCING = (0.6, 0.3)
 PARALLEL_CONVINCING = (CONVINCING, 0.5 * CONVINCING)
 # Standard deviation of the distance of a pipe found by its lines [m]: its width tells a twentieth, the cloud more.
 LINE_DEPTH_SIGMA = 0.03
+# Standard deviations, or radii if these are more (a contour is that far from the axis), by which the depth of a fit may
+# differ from what was expected.
+DEPTH_KEPT = 3.0
 # Standard deviation of a slope to which a fit is held [rad]: a tenth of that of parallel pipes, so that the search
 # keeps to it. From its middle the ends of six metres are then 2 mm aside: its axis is known to this [m].
 DIRECTION_HELD, HELD_AXIS = 0.1 * PARALLEL_SIGMA, 2e-3
@@ -72,7 +75,8 @@ class LineFitter:
             if fit is not None
         ]
         fits = [self._parallel(each, LINE_DEPTH_SIGMA, known) for each in again]
-        return max((fit for fit in fits if fit is not None), key=lambda fit: fit.log_odds, default=None)
+        seen = [fit for fit in fits if fit is not None and _keeps_depth(fit.cylinder, rough, centre)]
+        return max(seen, key=lambda fit: fit.log_odds, default=None)
 
     def _parallel(self, start: Cylinder, depth_sigma: float, known: Sequence[Cylinder]) -> ContourFit | None:
         """The accepted fit of a pipe that is parallel to known ones.
@@ -139,6 +143,19 @@ class LineFitter:
             and Scene.of(fit.cylinder, self.views, known).own_support().weaker_share >= least[1]
             and not fit.is_flat
         )
+
+
+def _keeps_depth(cylinder: Cylinder, expected: Sequence[tuple[Cylinder, float]], centre: FloatArray | None) -> bool:
+    """Whether a cylinder is as far from `centre` as one of those expected, each with a standard deviation [m]."""
+    if centre is None:
+        return True
+    far, *others = (
+        float(np.linalg.norm(each.from_axis(centre[None]))) for each in (cylinder, *(one for one, _ in expected))
+    )
+    return any(
+        abs(other - far) < DEPTH_KEPT * max(sigma, one.radius)
+        for other, (one, sigma) in zip(others, expected, strict=True)
+    )
 
 
 def aligned(

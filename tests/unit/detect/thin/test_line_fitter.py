@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.thin import line_fitter
+from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned
 from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL
 from pipeprog_detect.types import Cylinder
@@ -78,3 +80,21 @@ def test_what_may_have_any_radius_is_no_thin_pipe(share: float, stands: bool) ->
     fit = ContourFit(line, np.eye(3)[1:], np.eye(5), share * planned, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.1)
     lines = LineFitter(views, np.zeros((0, 3), np.float32), [planned], boq)
     assert lines._accepts(fit, [], (0.6, 0.0)) is stands
+
+
+@pytest.mark.parametrize(("nearer", "stands"), [(0.0, True), (0.04, True), (0.06, False), (0.347, False)])
+def test_a_fit_that_leaves_the_depth_that_was_expected_is_refused(
+    nearer: float, stands: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Edges beside a pipe make it too wide: with its radius held it was drawn to the cameras, by twenty sigma."""
+    boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    start = level(0.5)
+    towards = np.array([0.0, -nearer, 0.0])
+    moved = Cylinder(start.start + towards, start.end + towards, start.radius)
+    fit = ContourFit(moved, np.eye(3)[1:], np.eye(5), 1.6e-4, 0.73, 46.0, 20, (0.0, 0.0), 0.0, 0.1)
+    monkeypatch.setattr(line_fitter, "refine", lambda *_: fit)
+    monkeypatch.setattr(LineFitter, "_accepts", lambda *_: True)
+    lines = LineFitter(views, np.zeros((0, 3), np.float32), [start.radius], boq)
+    found = lines.along_known_pipes(Proposal(start, 0.0157, 30.0), [])
+    assert found is (fit if stands else None)
