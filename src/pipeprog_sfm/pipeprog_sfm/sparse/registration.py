@@ -25,6 +25,9 @@ LOCAL_WINDOW = 8  # views that local bundle adjustment moves: those that see a p
 # Of the share of features with a point that the views around it in time have, the part below which a view's velocity,
 # and so its pose, may be wrong: with the velocity off by 0.7 m/s (read-out 30 ms, a path that turned) it had 0.4.
 DOUBTFUL, AROUND = 0.6, 4
+# Of the views of a trajectory, the most that may hang on by few points: before the read-out was found, seven of 39 had
+# turned away together. More may be of another room.
+PIECE = 0.25
 # Of the points that the views before and after a moment share, usually; with less, a few views at an end may have poses
 # and velocities of their own: 0.15 was seen at 1.4 m/s and 20 ms (two views 0.8 m off), 0.5 at ends and in turns.
 LOOSE = 0.3
@@ -110,8 +113,8 @@ def doubtful_views(model: SparseModel, keyframes: Mapping[int, Keyframe]) -> lis
     some views have fewer than others.
 
     With a rolling shutter a view that is registered before what follows it may take a wrong velocity where the camera
-    turns; features that are unrolled by it agree with a wrong pose, which confirms the velocity. Up to `AROUND` views
-    in a row may do so together: they share points with each other, and few with the rest.
+    turns; features that are unrolled by it agree with a wrong pose, which confirms the velocity. Views in a row may do
+    so together: they share points with each other, and few with the rest.
     keyframes: at least those of the model's views, by stamp.
     """
     frames = np.array([keyframes[stamp].frame for stamp in model.stamps])
@@ -128,7 +131,7 @@ def doubtful_views(model: SparseModel, keyframes: Mapping[int, Keyframe]) -> lis
             if len(near) and held[number] < DOUBTFUL * np.median(held[near]):
                 doubtful.add(view)
         for piece in _pieces(seen):
-            if len(piece) <= AROUND and 2 * len(piece) < len(own):
+            if len(piece) <= max(AROUND, PIECE * len(own)) and 2 * len(piece) < len(own):
                 doubtful.update(own[piece].tolist())
     return sorted(doubtful)
 
