@@ -74,6 +74,7 @@ class MetricTracker:
             self._first_frame = frame
         self._cameras[stamp] = camera
         ellipses = detect_ellipses(gray, camera, self._config)
+        self._sought.pop(stamp, None)  # of another image of that stamp
         found = detect_boards(ellipses, self._board_file.boards, camera)
         if len(ellipses):
             self._ellipses[stamp] = ellipses

@@ -74,16 +74,25 @@ def row_motions(
     for view in views.tolist():
         keyframe = keyframes[model.stamps[view]]
         by_camera[keyframe.frame, keyframe.camera].append(view)
-    long_tracks = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points)) >= LONG_TRACK
+    centres = model.centres()
     found: dict[int, RowMotion] = {}
     for members in by_camera.values():
         order = np.array(sorted(members, key=model.stamps.__getitem__))
         stamps = np.array([model.stamps[view] for view in order], np.int64)
         ends = np.flatnonzero(np.diff(stamps) > MAX_GAP * 1e9) + 1
         for part in np.split(order, ends):
-            is_long = near is None and len(part) >= LONG_TRAJECTORY
-            found |= _along(model, part, keyframes, readout, wanted, long_tracks, is_long)
-    return found
+            own = [model.stamps[view] for view in part]
+            velocities = _velocities(own, model.rotation[part], centres[part])  # none of a single view
+            motions = {
+                stamp: RowMotion(readout, keyframes[stamp].camera.height, linear, angular)
+                for stamp, linear, angular in zip(own, *velocities, strict=False)
+            }
+            if motions and readout > 0.0:
+                is_long = near is None and len(part) >= LONG_TRAJECTORY
+                motions |= _by_own_rows(model, part, keyframes, motions, wanted, is_long)
+            found |= motions
+    asked = {model.stamps[view] for view in wanted}
+    return {stamp: motion for stamp, motion in found.items() if stamp in asked}
 
 
 def unroll(model: SparseModel, keyframes: MutableMapping[int, Keyframe], motions: Mapping[int, RowMotion]) -> float:
@@ -186,47 +195,42 @@ def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatAr
     return np.asarray(depths)
 
 
-def _along(
+def _by_own_rows(
     model: SparseModel,
     views: IntArray,
     keyframes: Mapping[int, Keyframe],
-    readout: float,
+    motions: Mapping[int, RowMotion],
     wanted: Container[int],
-    long_tracks: NDArray[np.bool_],
     is_long: bool,
 ) -> dict[int, RowMotion]:
-    """As `row_motions`, for views of one camera in order of time, without long gaps between them.
+    """Motions of the views, in order of time, that follow their own rows and not the spline's `motions`, by stamp.
 
-    wanted: views whose motions are asked for; long_tracks (P,): points with LONG_TRACK views; is_long: whether some at
-    each end and those that contradict the spline follow their own rows, and not the outermost ones alone.
+    Those are the outermost ones; in a long trajectory END_KNOTS at each end, and those that contradict the spline.
+    Views that are not `wanted` are left out.
     """
     stamps = [model.stamps[view] for view in views]
-    velocities = _velocities(stamps, model.rotation[views], model.centres()[views])
     gaps = np.diff(stamps, prepend=stamps[0], append=stamps[-1]) * 1e-9
     sigmas = END_CHANGE * np.maximum(gaps[:-1], gaps[1:])
-    motions: dict[int, RowMotion] = {}
+    has_many = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points)) >= LONG_TRACK
+    at_ends: dict[int, RowMotion] = {}
     inner: dict[int, RowFit] = {}
-    for number, (linear, angular) in enumerate(zip(*velocities, strict=True)):
-        stamp, view = stamps[number], int(views[number])
-        if view not in wanted:
-            continue
-        keyframe = keyframes[stamp]
-        motions[stamp] = motion = RowMotion(readout, keyframe.camera.height, linear, angular)
+    for number, view in enumerate(views.tolist()):
         inwards = min(number, len(views) - 1 - number)
         at_end = inwards < (END_KNOTS if is_long else 1)
-        if readout == 0.0 or not (at_end or is_long):
+        if view not in wanted or not (at_end or is_long):
             continue
+        stamp = stamps[number]
         own = model.point_of[model.features(view)]
-        features = np.flatnonzero((own >= 0) & long_tracks[own])
+        features = np.flatnonzero((own >= 0) & has_many[own])
         inside = model.points[own[features]] @ model.rotation[view].T + model.translation[view]
         sigma = sigmas[number] * (DECAY**inwards if at_end else 1.0)
-        fit = fit_rows(inside, keyframe, features, model.noise, motion, sigma)
+        fit = fit_rows(inside, keyframes[stamp], features, model.noise, motions[stamp], sigma)
         if at_end:
-            motions[stamp] = fit.motion
+            at_ends[stamp] = fit.motion
         else:
             inner[stamp] = fit
     wrong = _contradicted(list(inner.values()))
-    return motions | {
+    return at_ends | {
         stamp: fit.motion for (stamp, fit), is_wrong in zip(inner.items(), wrong, strict=True) if is_wrong
     }
 
