@@ -56,12 +56,13 @@ FOLDERS = {
     "pipeprog_node": {"received": {"messages", "intake"}},
     "pipeprog_sfm": {
         "features": set(),
-        "sparse": {"features"},
+        "model": {"features"},
+        "sparse": {"features", "model"},
         "boards": set(),
         "metric": {"boards"},
         "dense": set(),
         "calibration": {"boards"},
-        "alignment": {"features", "sparse", "boards"},
+        "alignment": {"features", "model", "sparse", "boards"},
     },
     "pipeprog_detect": {
         "cloud": set(),

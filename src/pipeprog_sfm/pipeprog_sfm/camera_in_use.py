@@ -8,7 +8,7 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import CalibrationConfig
-from pipeprog_sfm.sparse.self_calibration import RADII, Priors, Refinement, numbers_of
+from pipeprog_sfm.model.self_calibration import RADII, Priors, Refinement, numbers_of
 
 FIRST_CHECK = 6  # keyframes: fewer tie points seen from three sides do not tell k1 to a third of its prior
 CHECK_GROWTH = 2  # ratio of the keyframes at two checks while keyframes come: their cost stays a constant share

@@ -32,10 +32,10 @@ from pipeprog_sfm.metric.scale import DISAGREEMENT, NoScaleError, ScaleEstimate
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.metric.unrolled_ellipses import RollingViews
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.sparse.overlap import OverlapReport
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.types import EncodedImage
 
 READOUT_ROUNDS = 3  # of read-out and poses in turns: velocities follow the poses, a round leaves a tenth of the error

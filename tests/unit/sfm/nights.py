@@ -17,8 +17,8 @@ from pipeprog_sfm.alignment.survey_map import SurveyMap, sparse_part
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.mapper import Mapper
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 SCALE_SIGMA = 0.0003
 # The corner's y axis is down, that of a map z up.

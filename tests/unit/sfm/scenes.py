@@ -15,8 +15,8 @@ from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import match
 from pipeprog_sfm.features.sift import Features, root_sift
-from pipeprog_sfm.sparse.bundle_adjustment import Bundle, rotation_from_vector
-from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.model.bundle_adjustment import Bundle, rotation_from_vector
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.two_view import model_from_pair
 
 VIEWS, POINTS = 6, 150

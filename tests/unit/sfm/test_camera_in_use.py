@@ -11,7 +11,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.camera_in_use import FIRST_CHECK, UNKNOWN_READOUT, CameraInUse, board_agrees, radial_warning
 from pipeprog_sfm.config import CalibrationConfig
-from pipeprog_sfm.sparse.self_calibration import RADII, Refinement, changed
+from pipeprog_sfm.model.self_calibration import RADII, Refinement, changed
 
 TOLD = Camera(848, 480, 600.0, 600.0, 423.5, 239.5)
 SIGMAS = np.array([0.0003, 0.0002, np.inf, np.inf])

@@ -14,9 +14,9 @@ from pipeprog_sfm.alignment.plane_check import PlaneCheck, agree_across, check_p
 from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.model.model_adjustment import adjust_points, adjust_views
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.guided_matching import link_among
-from pipeprog_sfm.sparse.model_adjustment import adjust_points, adjust_views
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 LEAST_SHARED = 0.1  # of its points that both see, where a board places the survey: by chance one in fifty matches
 TURNS = 2  # of matching and adjusting: the second finds what the first, a few px off, has not

@@ -18,10 +18,10 @@ from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
-from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import CAUCHY, rotation_from_vector
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.model_merging import similarity_between
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 NEAR = 8.0  # px by which a feature may miss under the similarity of another keyframe: 2 % of drift over a metre
 MAX_LOCATED = 40  # keyframes that are looked for, evenly thinned: the others are found by the poses of these

@@ -14,7 +14,7 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
-from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.model.sparse_model import SparseModel
 
 FEATURES_PER_VIEW = 600  # that are kept of a keyframe: thirty times what a pose needs, 84 kB
 LEAST_VIEWS = 3  # of a point that is kept: two rays always meet somewhere, the third confirms the point

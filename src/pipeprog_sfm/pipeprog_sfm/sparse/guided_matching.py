@@ -10,7 +10,7 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray, match_guided
-from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.model.sparse_model import SparseModel
 
 GUIDED_RADIUS = 4.0  # px around the epipolar segment, as POSE_ERROR: poses are known to a pixel or two
 TEMPORAL = 3  # nearest in time of its camera, always matched with: at 80 % overlap they see nearly the same

@@ -9,8 +9,8 @@ from pipeprog_camera.arrays import IntArray
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
 from pipeprog_sfm.features.retrieval import Retrieval
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.registration import Location, locate
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 
 class Localizer:

@@ -10,12 +10,12 @@ from scipy.linalg import expm, logm
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_sfm.features.retrieval import COARSE, PREVIEW
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.guided_matching import link, partners
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.model_merging import similarity_between
 from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS
 from pipeprog_sfm.sparse.sparse_map import SparseMap
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 LOOP_INTERVAL = 4  # try to close a loop at every 4th keyframe: a revisited place stays in view longer than that
 # Matches among the PREVIEW strongest features that make a full comparison worth while: an image that shares MIN_INLIERS

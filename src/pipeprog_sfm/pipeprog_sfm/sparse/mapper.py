@@ -16,14 +16,14 @@ from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
 from pipeprog_sfm.features.sift import Features, extract
+from pipeprog_sfm.model.row_motion import predicted_motion, row_motions, told_by_rows, unrolled_by
+from pipeprog_sfm.model.self_calibration import Priors, Refinement, refine
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
 from pipeprog_sfm.sparse.model_merging import merge_models
 from pipeprog_sfm.sparse.registration import add_view, doubtful_views, rejection_reason
-from pipeprog_sfm.sparse.row_motion import predicted_motion, row_motions, told_by_rows, unrolled_by
-from pipeprog_sfm.sparse.self_calibration import Priors, Refinement, refine
 from pipeprog_sfm.sparse.sparse_map import MAX_TURNS, SparseMap
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 from pipeprog_sfm.sparse.two_view import model_from_pair
 
 GROWTH = 1.3  # in views, between two global adjustments: their cost stays a constant share of the whole

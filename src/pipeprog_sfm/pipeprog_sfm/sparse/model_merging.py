@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS, Location
 from pipeprog_sfm.sparse.sparse_map import SparseMap
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 DEPTH_TOLERANCE = 0.05  # relative difference of a point's depth in two models: its noise at the smallest ray angle
 AGREEING = 0.5  # share of the points of two models whose depths agree: with fewer one of the models is bent

@@ -11,8 +11,8 @@ import numpy as np
 from pipeprog_camera.arrays import IntArray
 from pipeprog_camera.view_overlap import sample, view_overlap
 from pipeprog_sfm.features.keyframe import Keyframe, grid_cells, hull_area
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 NO_STAMP = -1
 # Views of earlier visits that show the same, from which on another one adds little: one visit, where the keyframes of

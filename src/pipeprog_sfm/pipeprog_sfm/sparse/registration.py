@@ -11,11 +11,11 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
+from pipeprog_sfm.model.model_adjustment import adjust_model, adjust_views
+from pipeprog_sfm.model.row_motion import near_in_time, row_motions, unroll
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.colmap import AbsolutePose, absolute_pose
 from pipeprog_sfm.sparse.guided_matching import link
-from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_views
-from pipeprog_sfm.sparse.row_motion import near_in_time, row_motions, unroll
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 POSE_ERROR = 4.0  # px, inlier threshold of RANSAC: points are off by a pixel or two before they are adjusted
 MIN_INLIERS = 20  # of a pose: by chance one match in 18 000 lies within 4 px (of 1280 x 720)

@@ -12,13 +12,13 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
+from pipeprog_sfm.model.model_adjustment import adjust_model, adjust_points, pose_covariance
+from pipeprog_sfm.model.row_motion import row_motions, unroll
+from pipeprog_sfm.model.self_calibration import RADII, radial_residuals
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.guided_matching import link
-from pipeprog_sfm.sparse.model_adjustment import adjust_model, adjust_points, pose_covariance
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
 from pipeprog_sfm.sparse.registration import rejection_reason
-from pipeprog_sfm.sparse.row_motion import row_motions, unroll
-from pipeprog_sfm.sparse.self_calibration import RADII, radial_residuals
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 ERROR_SAMPLE = 20_000  # observations that give the mean error: with a spread of 1 px, to 1 / sqrt(20 000) = 0.007 px
 MAX_TURNS = 3  # of shifts and poses where they are to settle: see `row_motion`

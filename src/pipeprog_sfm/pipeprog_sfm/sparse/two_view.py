@@ -7,11 +7,11 @@ import numpy as np
 
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
+from pipeprog_sfm.model.model_adjustment import adjust_model
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.colmap import relative_pose
 from pipeprog_sfm.sparse.guided_matching import link
-from pipeprog_sfm.sparse.model_adjustment import adjust_model
 from pipeprog_sfm.sparse.registration import POSE_ERROR
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 START_POINTS = 40  # of a new model: twice the inliers that a pose must have
 START_ITERATIONS, START_TOLERANCE = 20, 1e-4  # of the adjustment: farther from the minimum than a map that grows

@@ -14,7 +14,7 @@ from pipeprog_sfm.metric.rig import rig_measurements
 from pipeprog_sfm.metric.scale import ScaleWarning
 from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.transform_tree import Transform, TransformTree
-from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import rotation_from_vector
 from tests.unit.sfm.metric.test_transform_tree import SECOND, Robot, pose_of, random_pose
 
 PERFECT = OdometryConfig(baseline_sigma=0.0)

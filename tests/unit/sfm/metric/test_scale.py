@@ -23,7 +23,7 @@ from pipeprog_sfm.metric.scale import Measurement, NoScaleError, ScaleWarning
 from pipeprog_sfm.metric.scale_evidence import PosedEvidence, ScaleEvidence
 from pipeprog_sfm.metric.scale_sources import SOURCES
 from pipeprog_sfm.metric.vertical_from_planes import PlanesError, vertical_from_planes
-from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, function_covariance
+from pipeprog_sfm.model.bundle_adjustment import Bundle, adjust, function_covariance
 
 CONFIG = BoardConfig()
 

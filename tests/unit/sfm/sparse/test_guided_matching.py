@@ -7,8 +7,8 @@ import numpy as np
 from scenes import BASE, CAMERA, STEP, centre, keyframe, pose, started, view
 
 from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.guided_matching import link, partners
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 
 def place(model: SparseModel, one: Keyframe, x: float) -> int:

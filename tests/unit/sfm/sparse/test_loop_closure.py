@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scenes import POINTS, VIEWS, sparse_model
 
-from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import rotation_from_vector
+from pipeprog_sfm.model.sparse_model import NONE
 from pipeprog_sfm.sparse.loop_closure import correction_weights, distribute_correction, is_drift, loop_candidates
-from pipeprog_sfm.sparse.sparse_model import NONE
 
 SCALE = 1.02
 CORRECTION = np.eye(4)

@@ -8,11 +8,11 @@ import pytest
 from scenes import STEP, in_model, keyframe, matched, started
 
 from pipeprog_sfm.features.retrieval import Retrieval
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.model_merging import merge, merge_models, similarity_between
 from pipeprog_sfm.sparse.registration import add_view, locate
 from pipeprog_sfm.sparse.sparse_map import SparseMap
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 TOLERANCE = 0.02  # of the base: 0.3 px of 300 points at 2 m are some 3 mm of a view's place
 

@@ -12,8 +12,8 @@ from scenes import BASE, CAMERA, STEP, pose, view
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe, hull_area
 from pipeprog_sfm.features.sift import Features
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.overlap import OverlapTracker, place_overlap
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 
 def keyframe(stamp: int, corners: list[tuple[float, float]]) -> Keyframe:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import VIEWS, bundle
 
-from pipeprog_sfm.sparse.bundle_adjustment import Bundle, adjust, rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import Bundle, adjust, rotation_from_vector
 
 
 def disturbed(truth: Bundle, free: NDArray[np.bool_]) -> Bundle:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_sfm.sparse.tracks import NONE, digests, extend, filter_tracks, triangulate
+from pipeprog_sfm.model.tracks import NONE, digests, extend, filter_tracks, triangulate
 
 MAX_ERROR = 3.0  # px: the noise of SIFT is below 1 px, wrong matches are uniform in the search range
 INITIAL_NOISE = 1.0  # px, of a coordinate, before it can be estimated: more than SIFT has

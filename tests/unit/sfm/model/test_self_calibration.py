@@ -11,9 +11,9 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
-from pipeprog_sfm.sparse.model_adjustment import adjust_model
-from pipeprog_sfm.sparse.self_calibration import Priors, refine
-from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.model.model_adjustment import adjust_model
+from pipeprog_sfm.model.self_calibration import Priors, refine
+from pipeprog_sfm.model.sparse_model import SparseModel
 
 TRUE = Camera(848, 480, 600.0, 600.0, 423.5, 239.5, "plumb_bob", (0.0, 0.0, 0.0, 0.0))
 NOISE = 0.2  # px

@@ -18,11 +18,11 @@ from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
+from pipeprog_sfm.model.row_motion import row_motions, told_by_rows
+from pipeprog_sfm.model.self_calibration import Priors
+from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.registration import doubtful_views
-from pipeprog_sfm.sparse.row_motion import row_motions, told_by_rows
-from pipeprog_sfm.sparse.self_calibration import Priors
-from pipeprog_sfm.sparse.sparse_model import SparseModel
 
 READOUT = 0.03  # s
 SPEED = 0.8  # m/s

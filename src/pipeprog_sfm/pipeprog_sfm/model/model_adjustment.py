@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, Bundle, adjust, function_covariance
-from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.model.bundle_adjustment import CAUCHY, Bundle, adjust, function_covariance
+from pipeprog_sfm.model.sparse_model import SparseModel
 
 NOISE_RANGE = (0.1, 1.0)  # px, of a coordinate: what image noise and SIFT's localisation allow
 RAYLEIGH_MEDIAN = 1.1774  # median length of a 2-D normal error, in standard deviations of a coordinate

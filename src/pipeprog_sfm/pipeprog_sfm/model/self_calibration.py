@@ -21,7 +21,7 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.sparse.bundle_adjustment import (
+from pipeprog_sfm.model.bundle_adjustment import (
     CAUCHY,
     eliminate_points,
     factorised,
@@ -30,8 +30,8 @@ from pipeprog_sfm.sparse.bundle_adjustment import (
     pairs_of_views,
     rotation_from_vector,
 )
-from pipeprog_sfm.sparse.row_motion import readout_rates
-from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.model.row_motion import readout_rates
+from pipeprog_sfm.model.sparse_model import SparseModel
 
 MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map
 MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera that its depth does not take up

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import FOCAL, POINTS, VIEWS, bundle, sparse_model
 
-from pipeprog_sfm.sparse.bundle_adjustment import rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import rotation_from_vector
 from pipeprog_sfm.sparse.registration import epipolar_errors
 
 

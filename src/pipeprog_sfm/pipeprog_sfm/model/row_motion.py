@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.sparse.row_fit import RowFit, fit_rows
-from pipeprog_sfm.sparse.sparse_model import SparseModel
+from pipeprog_sfm.model.row_fit import RowFit, fit_rows
+from pipeprog_sfm.model.sparse_model import SparseModel
 
 MAX_GAP = 1.0  # s between two views that still tell the velocity between them: a hand sways at 1 to 2 Hz
 MIN_GAP = 0.02  # s between two knots: poses are known to 0.3 mm, and their difference over it to 0.02 m/s

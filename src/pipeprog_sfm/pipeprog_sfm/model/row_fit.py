@@ -10,7 +10,7 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.sparse.bundle_adjustment import CAUCHY, rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import CAUCHY, rotation_from_vector
 
 MAX_STEPS = 10  # of Gauss-Newton: it converges in three to six
 CONVERGED = 0.01  # px, root mean square of a step over the points, a thirtieth of their noise
