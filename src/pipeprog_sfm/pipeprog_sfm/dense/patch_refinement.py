@@ -26,6 +26,10 @@ SAME_PLANE = 0.0007  # of the depth, a fifth of STEP_MAX: Gauss-Newton takes pla
 GAIN_MIN, GAIN_MAX = 0.7, 1.4  # of one view's contrast over another's: exposure, viewing angle
 NOISE = 0.7  # [grey levels] of two 8-bit images' difference at best
 FLATNESS = 2e-4  # of the depth: how far a pipe of 50 mm bulges over the plane's 9 px at 2 m, 0.4 mm
+# Square of the noise of a difference of neighbouring pixels, by that of a difference of two images: half of this is one
+# image's, a difference has twice as much, and interpolation between two rows leaves two thirds.
+DIFFERENCE_NOISE = 2.0 / 3.0
+TEXTURE_MIN = 1.0 / 3.0  # of texture, in what texture and noise have together: with less, the noise makes the step
 OVERLAP = (2 * RADIUS + 1) ** 2 / 4.0  # patches that share a pixel on a grid of stride 2: their errors go together
 ROUNDS = (4, 2)  # distance in grid pixels at which each round takes over planes: beyond PLANE_RADIUS, on other data
 
@@ -214,7 +218,8 @@ def _match(  # type: ignore[no-untyped-def]
     hold four pixels each (`fours`).
     """
     one, size = np.float32(1.0), np.float32(SIZE)
-    gradient, curvature, residual, used = np.float32(0.0), np.float32(0.0), np.float32(0.0), 0
+    gradient, curvature, shift = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    residual, used = np.float32(0.0), 0
     height, width = neighbours.shape[1:]
     pixels = neighbours.reshape(len(neighbours), height * width)
     for n in range(len(neighbours)):
@@ -252,13 +257,19 @@ def _match(  # type: ignore[no-untyped-def]
         gain = min(max(np.sqrt(energy / (ww + np.float32(1e-6))), np.float32(GAIN_MIN)), np.float32(GAIN_MAX))
         gradient += gain * (cp - gain * cw)
         curvature += gain * gain * cc
+        shift += gain * gain * (dx * dx + dy * dy)
         residual += energy - np.float32(2.0) * gain * wp + gain * gain * ww
         used += 1
     total = _sum_of_best(scores, better_half)
     if used == 0 or not curvature > 0.0:
         return np.float32(-1.0), np.float32(0.0), np.float32(0.0)
-    variance = max(residual, np.float32(0.0)) / np.float32(used * SIZE) + np.float32(NOISE * NOISE)
-    return total / np.float32(better_half), gradient / curvature, np.sqrt(variance / curvature)
+    noise = max(residual, np.float32(0.0)) / np.float32(used * SIZE)
+    # The derivatives are differences of noisy pixels: what their noise adds to the curvature shortens the step (errors
+    # in variables; Fuller, Measurement Error Models, 1987).
+    texture = curvature - np.float32(DIFFERENCE_NOISE * SIZE) * noise * shift
+    texture = max(texture, np.float32(TEXTURE_MIN) * curvature)
+    sigma = np.sqrt((noise + np.float32(NOISE * NOISE)) * curvature) / texture
+    return total / np.float32(better_half), gradient / texture, sigma
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
