@@ -70,21 +70,28 @@ class Search:
 
         The `known` ones are measured again, and others sought among the points (N,) that are `fresh`. A candidate that
         the scene rejects (a corner, a hollow) is dropped; one too rough for the cloud alone is put to the keyframes.
-        Last come hypotheses to which no fit with a free radius led, at the planned radii near them.
+        One that they refuse is put to them again once its neighbours are known, which may hide a side of it. Last come
+        hypotheses to which no fit with a free radius led, at the planned radii near them.
         """
         free = np.ones(len(self.tree.points), bool)
         accepted: list[Candidate] = []
+        refused: list[Candidate] = []
         without_fit: list[Hypothesis] = []
 
-        def consider(hypothesis: Hypothesis, hold_radius: bool = False) -> None:
-            candidate = fit_candidate(self.tree, free, hypothesis, self.criteria.noise, hold_radius=hold_radius)
-            if candidate is None and not hold_radius:
+        def accept(candidate: Candidate) -> None:
+            accepted.append(candidate)
+            cylinder = candidate.cylinder
+            reach = cylinder.radius + 3.0 * candidate.band
+            free[self.tree.near_segment(cylinder.start, cylinder.end, reach)] = False
+
+        def consider(hypothesis: Hypothesis) -> None:
+            candidate = fit_candidate(self.tree, free, hypothesis, self.criteria.noise)
+            if candidate is None:
                 without_fit.append(hypothesis)
-            elif candidate is not None and self._accepts(candidate):
-                accepted.append(candidate)
-                cylinder = candidate.cylinder
-                reach = cylinder.radius + 3.0 * candidate.band
-                free[self.tree.near_segment(cylinder.start, cylinder.end, reach)] = False
+            elif self._accepts(candidate):
+                accept(candidate)
+            else:
+                refused.append(candidate)
 
         for cylinder in known:
             consider(Hypothesis(cylinder, 0))
@@ -92,10 +99,15 @@ class Search:
         for hypothesis in self._sections(free, planes) if sections else self._voted(fresh, free):
             consider(hypothesis)
         if self.verifier.has_views:
+            for candidate in refused:
+                if self._accepts_beside([known.cylinder for known in accepted], candidate):
+                    accept(candidate)
             for hypothesis in sorted(without_fit, key=lambda each: -each.votes):
                 for planned in self._at_planned_radii(hypothesis):
                     if not any(_holds(known.cylinder, planned.cylinder) for known in accepted):
-                        consider(planned, hold_radius=True)
+                        held = fit_candidate(self.tree, free, planned, self.criteria.noise, hold_radius=True)
+                        if held is not None and self._accepts_beside([each.cylinder for each in accepted], held):
+                            accept(held)
         self.report(0.8, "measuring")
         # Where the noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
         return [
@@ -110,13 +122,21 @@ class Search:
         if self.criteria.accept(candidate):
             return True
         proposed = self.criteria.relaxed(_PROPOSED_ROUGHNESS)
-        if candidate.radius_held:
-            return proposed.of_held_radius().accept(candidate) and self.verifier.verify(candidate)
         if proposed.accept(candidate):
             return self.verifier.verify(candidate)
         least = proposed.slenderness * candidate.cylinder.radius
         is_piece = proposed.of_piece().accept(candidate) or proposed.of_short_piece().accept(candidate)
         return is_piece and self.verifier.verify(candidate, least)
+
+    def _accepts_beside(self, known: Sequence[Cylinder], candidate: Candidate) -> bool:
+        """Whether the known cylinders leave enough of a candidate visible that the keyframes make a pipe of it."""
+        proposed = self.criteria.relaxed(_PROPOSED_ROUGHNESS)
+        return (
+            (proposed.of_held_radius() if candidate.radius_held else proposed).accept(candidate)
+            and not any(_holds(each, candidate.cylinder) for each in known)
+            and not self.around.rejects(candidate)
+            and self.verifier.verify_beside(candidate, known)
+        )
 
     def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:
         """A hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""

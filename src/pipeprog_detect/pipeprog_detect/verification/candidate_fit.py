@@ -134,13 +134,21 @@ class CandidateFitter:
         """The fit of a candidate of which others hide one side in all views, with the planned radius that it shows.
 
         None where the cloud allows none, or where the keyframes do not tell it from the next planned one. The surface
-        that the cloud shows and the side that is seen tell the radius together.
+        that the cloud shows and the side that is seen tell the radius together; one that was given to the candidate is
+        no observation, and what they tell where it is left free takes its place.
         Stereo makes an arc too flat, never too narrow: a thinner planned radius may be farther from the cloud's.
         Where the cloud resolves the section any support that makes a fit suffices. Where it does not, or the radius
         was given to it, more than half of the contour must be supported, where the surface allows it.
         """
-        radius, sigma = candidate.cylinder.radius, candidate.arc_sigma
         told_by_cloud = is_resolved(candidate) and not candidate.radius_held
+        if candidate.radius_held:
+            start = Start(candidate.cylinder, _sigma(candidate), ends_known=True, seen=_seen_arc(candidate))
+            free = refine(start, views, others)
+            if free is None:
+                return None
+            sigma = float(np.hypot(free.radius_sigma, MANUFACTURE * free.cylinder.radius))
+            candidate = replace(candidate, cylinder=free.cylinder, radius_sigma=sigma)
+        radius, sigma = candidate.cylinder.radius, candidate.arc_sigma
         ranked = []
         for planned in self._radii():
             misfit = (planned - radius) / sigma

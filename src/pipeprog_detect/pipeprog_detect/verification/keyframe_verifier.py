@@ -14,6 +14,7 @@ from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.extension import LEAST_STUB
 from pipeprog_detect.silhouette.free_space import free_stretches
+from pipeprog_detect.silhouette.one_sided import only_visible_side
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter
@@ -49,8 +50,8 @@ class KeyframeVerifier:
         Where the cloud resolves its section and has that radius as well, any support that makes a fit suffices. Where
         it does not, a glossy pipe's highlight may be taken for its contour, unless the radius is held to a planned one.
 
-        A candidate whose radius was held, and one of which the cloud resolves the section and the keyframes show no
-        other side, is verified by the side that they show of it.
+        One of which the cloud resolves the section and the keyframes show no other side is verified by the side that
+        they show of it.
 
         `least_length` [m]: they must show it as long as that, however much of it the cloud has (a smooth white pipe
         gives stereo points at its ends alone).
@@ -58,11 +59,6 @@ class KeyframeVerifier:
         cylinder = candidate.cylinder
         if not self.has_views or any(_resembles(cylinder, refused) for refused in self._refused):
             return False
-        if candidate.radius_held:
-            stands = self._fitter.of_visible_side(candidate, [], self._views) is not None
-            if not stands:
-                self._refused.append(cylinder)
-            return stands
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
         fit = self._fitter.fit(candidate, [], views, follow=False)
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
@@ -79,6 +75,21 @@ class KeyframeVerifier:
                 self._refused.append(cylinder)
                 return False
         return True
+
+    def verify_beside(self, candidate: Candidate, others: Sequence[Cylinder]) -> bool:
+        """Whether the keyframes make a pipe of a candidate by what the others leave visible of it.
+
+        Its radius was held, or they hide one side of it: where both are visible, `verify` tells.
+        """
+        if candidate.radius_held:
+            if any(_resembles(candidate.cylinder, refused) for refused in self._refused):
+                return False
+        elif only_visible_side(Scene.of(candidate.cylinder, self._views, others)) is None:
+            return False
+        stands = self._fitter.of_visible_side(candidate, others, self._views) is not None
+        if not stands:
+            self._refused.append(candidate.cylinder)
+        return stands
 
     def measure(self, candidates: Sequence[Candidate], trusted: Sequence[bool]) -> list[MeasuredPipe]:
         """The candidates that stand, measured by their contours.

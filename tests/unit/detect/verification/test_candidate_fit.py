@@ -60,6 +60,19 @@ def test_of_a_pipe_that_shows_one_side_the_plan_tells_the_radius(pipe_views: lis
     assert np.linalg.norm(one.cylinder.from_axis(true.middle[None])[0]) < 3e-3
 
 
+@pytest.mark.parametrize("share", [0.9, 1.15])
+def test_a_radius_that_was_given_to_a_candidate_is_no_observation(pipe_views: list[View], share: float) -> None:
+    """Of a pipe of which a neighbour hides one side: the cloud has its surface, and got the radius of another size."""
+    true, other = pipe_and_wall.PIPE, share * pipe_and_wall.PIPE.radius
+    evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
+    given = with_radius(Scene.of(true, pipe_views, [BEFORE]), SeenArc(evidence.arc, 0.0015), other)
+    candidate = Candidate(given, 0.003, 3000, evidence, radius_held=True)
+    fitter = CandidateFitter(_boq(true.radius, other), MeasurementCache())
+    measured = fitter.of_visible_side(candidate, [BEFORE], pipe_views)
+    assert measured is not None
+    assert measured.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
+
+
 @pytest.mark.parametrize(("odds", "told"), [(190.0, 0.1095), (90.0, None), (80.0, 0.1223)])
 def test_the_side_that_is_seen_tells_two_planned_radii_apart(
     odds: float, told: float | None, monkeypatch: pytest.MonkeyPatch

@@ -33,6 +33,15 @@ def test_a_pipe_that_few_keyframes_of_many_show_is_verified(pipe_views: list[Vie
     assert not KeyframeVerifier(elsewhere, BOQ).verify(candidate)
 
 
+def test_a_candidate_of_which_a_neighbour_hides_one_side_stands_beside_it(pipe_views: list[View]) -> None:
+    neighbour = Cylinder(np.array([0.1, -0.08, -0.5]), np.array([0.08, -0.08, 0.5]), 0.09)
+    evidence = CloudEvidence(np.radians(130.0), 0.9, 0.0, 0.0015, 0.0, 3.0)
+    rough = Candidate(replace(PIPE, radius=PIPE.radius + 0.003), 0.0015, 3000, evidence)
+    verifier = KeyframeVerifier(pipe_views, BOQ)
+    assert verifier.verify_beside(rough, [neighbour])
+    assert not verifier.verify_beside(rough, [])  # whoever shows both sides is verified by both
+
+
 def test_a_blurred_candidate_whose_highlight_makes_a_contour_is_verified_at_a_planned_radius(
     pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
