@@ -215,7 +215,10 @@ def _with_blur(views: Sequence[View], measured: Sequence[MeasuredPipe]) -> list[
 
 
 def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:
-    """Those that stand before the walls and whose outlines are no others', as far as there are views to tell."""
+    """Those that stand before the walls and whose outlines are no others', as far as there are views to tell.
+
+    A pipe of which others hide both sides has no outlines of its own; it stands where the cloud tells the same of it.
+    """
     if not views:
         return list(measured)
 
@@ -225,7 +228,7 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
 
     clear = [each for each in measured if is_clear(each)]
     own = own_contours([each.cylinder for each in clear], views)
-    return [each for each, is_own in zip(clear, own, strict=True) if is_own]
+    return [each for each, is_own in zip(clear, own, strict=True) if is_own or each.is_as_in_cloud]
 
 
 def _judged(

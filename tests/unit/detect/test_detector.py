@@ -12,6 +12,7 @@ import pytest
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.errors import InputError
 from pipeprog_detect import detector
+from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -19,6 +20,7 @@ from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable
+from pipeprog_detect.verification.scene_context import SceneContext
 from tests.unit.detect.pipe_and_wall import PIPE
 
 CONFIG = DetectConfig()
@@ -199,3 +201,19 @@ def test_the_blur_of_the_views_is_that_of_thick_pipes(pipe_views: list[View]) ->
     of_cloud = replace(thick[0], fit=None)
     assert {view.blur for view in detector._with_blur(pipe_views, [*thick, thin, of_cloud])} == {0.7}
     assert detector._with_blur(pipe_views, [thin, of_cloud]) == pipe_views
+
+
+@pytest.mark.parametrize(("noise", "stands"), [(0.001, True), (0.02, False)])
+def test_a_pipe_of_which_others_hide_both_sides_stands_as_the_cloud_has_it(
+    pipe_views: list[View], noise: float, stands: bool
+) -> None:
+    """What no view shows beside the others was fitted to their edges, unless the cloud resolves the same pipe."""
+    hiding = [Cylinder(np.array([x, -0.08, -0.5]), np.array([x, -0.08, 0.5]), 0.09) for x in (-0.09, 0.09)]
+    found = []
+    for cylinder, spread in ((PIPE, noise), *((each, 0.02) for each in hiding)):
+        candidate = Candidate(cylinder, 0.2 * spread, 3000, CloudEvidence(np.pi, 0.9, 0.0, spread, 0.0, 300.0))
+        fit = ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, 90.0, 20, (0.0, 0.0), 0.0, 0.5)
+        found.append(MeasuredPipe.of_contour(candidate, fit))
+    nothing = octree.build(np.full((8, 3), 50.0))
+    genuine = detector._genuine(found, SceneContext(nothing, None, [], nothing, 1e-3), pipe_views)
+    assert [each.cylinder for each in genuine] == [PIPE] * stands + hiding

@@ -16,6 +16,7 @@ from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.free_space import SHORTEST, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, PipeEnd, View
+from pipeprog_detect.verification.radius_agreement import agree
 
 # What the cloud does not resolve is no pipe if it is shorter than this many radii: hangers and clamps are.
 SLENDER = 20.0
@@ -56,6 +57,11 @@ class MeasuredPipe:
         """The cloud's cylinder between the ends that the keyframes show; the sigma includes the cloud's noise."""
         sigma = float(np.hypot(candidate.radius_sigma, candidate.evidence.noise))
         return cls(candidate, candidate.cylinder.cut_like(fit.cylinder), sigma)
+
+    @property
+    def is_as_in_cloud(self) -> bool:
+        """Whether the cloud resolves the section and has the radius of the contour."""
+        return self.fit is not None and agree(self.candidate, self.fit)
 
 
 def joined(measured: Sequence[MeasuredPipe], views: Sequence[View], overlapping: bool = False) -> list[MeasuredPipe]:
