@@ -142,18 +142,30 @@ def _beside(
     Number of bins along it; bin (M,), distance from the axis in the image, at its depth (M,) [m], depth (M,) [m], and
     row among the points (M,).
     """
+    bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
+    rows, place, aside, far = seen_along(cylinder, points, centre, (-DEPTH_REACH, DEPTH_REACH))
+    cell = np.clip((place / cylinder.length * bins).astype(np.int64), 0, bins - 1)
+    return bins, cell, aside, far, rows
+
+
+def seen_along(
+    cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, reach: tuple[float, float]
+) -> tuple[NDArray[np.int64], NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+    """The cloud's points (N, 3) that `centre` sees along a cylinder, between `reach` [m] behind it (less: before it).
+
+    Row among the points (M,), position along the cylinder and distance from its axis in the image, both at its depth,
+    and depth (M,) [m].
+    """
     axis, towards, side = _sight(cylinder, centre)
     depth = float((cylinder.start - centre) @ towards)
     offset = points - centre.astype(np.float32)
     far = offset @ towards.astype(np.float32)
-    near = np.abs(far - depth) < DEPTH_REACH
+    near = (far - depth > reach[0]) & (far - depth < reach[1]) & (far > 0)
     offset, far = offset[near], far[near]
     place = (offset @ axis.astype(np.float32)) * depth / far - float((cylinder.start - centre) @ axis)
     aside = (offset @ side.astype(np.float32)) * depth / far
     along = (place > 0) & (place < cylinder.length)
-    bins = max(int(cylinder.length / (4.0 * cylinder.radius)), 3)
-    cell = np.clip((place[along] / cylinder.length * bins).astype(np.int64), 0, bins - 1)
-    return bins, cell, aside[along], far[along], np.flatnonzero(near)[along]
+    return np.flatnonzero(near)[along], place[along], aside[along], far[along]
 
 
 @njit(cache=True, nogil=True)

@@ -79,6 +79,13 @@ def find_thin_pipes(
         centre = mean_centre(cylinder, views)
         return around.touches_wall(cylinder) or (centre is not None and is_corner(cylinder, centre, around))
 
+    def is_missing(cylinder: Cylinder) -> bool:
+        """Whether the cloud, the walls or the known pipes would show or hide it, were it there."""
+        centre = mean_centre(cylinder, views)
+        return (centre is not None and is_bare(cylinder, lines.points, centre)) or (
+            Scene.of(cylinder, views, known).visible_share() < MOSTLY_SEEN
+        )
+
     def consider(fit: ContourFit | None) -> None:
         if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
             return
@@ -88,7 +95,7 @@ def find_thin_pipes(
             return
         if is_false_line(fit.cylinder, fit, some, around.planes, views, known):
             return
-        if is_bare(fit.cylinder, lines.points) or Scene.of(fit.cylinder, views, known).visible_share() < MOSTLY_SEEN:
+        if is_missing(fit.cylinder):
             return
         thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
         known.append(fit.cylinder)

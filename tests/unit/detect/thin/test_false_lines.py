@@ -112,13 +112,15 @@ def test_texture_goes_on_within_a_shadow_and_not_within_a_pipe(inside: float | N
 
 @pytest.mark.parametrize("before", [0.05, 0.3])
 @pytest.mark.parametrize(("shown", "stands"), [(0.0, False), (0.1, False), (0.3, True), (0.8, True)])
-def test_a_line_is_bare_where_the_cloud_shows_what_is_around_it_alone(
+def test_a_line_is_bare_where_the_cloud_shows_what_is_beside_and_behind_it_alone(
     before: float, shown: float, stands: bool
 ) -> None:
     line = Cylinder(np.array([-0.5, WALL - before, 0.0]), np.array([0.5, WALL - before, 0.0]), 0.0086)
     wall = wall_points().astype(np.float32)
     along = np.arange(-0.5, -0.5 + shown, 0.02)[:, None]
     barrel = (line.middle + along * line.axis + [0.0, -line.radius, 0.0]).astype(np.float32)
-    # Farther away the wall does not tell whether stereo would show it.
-    assert is_bare(line, np.concatenate([wall, barrel])) is (before < 0.15 and not stands)
-    assert not is_bare(line, wall[:: len(wall) // 20])
+    centre = np.array([0.0, WALL - 2.0, 0.1])
+    assert is_bare(line, np.concatenate([wall, barrel]), centre) is not stands
+    # A wall that stereo hardly shows does not tell whether it would show the line, nor does one before it.
+    assert not is_bare(line, wall[:: len(wall) // 20], centre)
+    assert not is_bare(line, wall - np.array([0.0, 1.0, 0.0], np.float32), centre)
