@@ -103,14 +103,18 @@ class LineFitter:
     def follow(self, piece: ContourFit, radius: float, known: Sequence[Cylinder]) -> ContourFit | None:
         """The whole of a pipe of the given radius [m] of which a piece was found.
 
-        Its depth, which lines seen from one height leave open, is that of the cloud's points before the wall.
+        Its depth, which lines seen from one height leave open, is that of the cloud's points before the wall. Where the
+        whole has no contour of a pipe, the piece stands if the cloud has it at its depth.
         """
         slope_known_to = float(np.sqrt(piece.covariance[3, 3]))
         start, slope_sigma = aligned(replace(piece.cylinder, radius=radius), known, self.views, slope_known_to)
         centre = mean_centre(start, self.views)
         at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, not np.isfinite(slope_sigma))
         depth_sigma = LINE_DEPTH_SIGMA if at_depth is None else DEPTH_SIGMA * radius
-        return self.measure(at_depth or start, known, depth_sigma, slope_sigma)
+        whole = self.measure(at_depth or start, known, depth_sigma, slope_sigma)
+        if whole is None and at_depth and _keeps_depth(piece.cylinder, [(at_depth, LINE_DEPTH_SIGMA)], centre):
+            return piece
+        return whole
 
     def measure(
         self,

@@ -98,3 +98,26 @@ def test_a_fit_that_leaves_the_depth_that_was_expected_is_refused(
     lines = LineFitter(views, np.zeros((0, 3), np.float32), [start.radius], boq)
     found = lines.along_known_pipes(Proposal(start, 0.0157, 30.0), [])
     assert found is (fit if stands else None)
+
+
+@pytest.mark.parametrize(
+    ("at_depth", "whole", "stands"),
+    [(0.05, False, True), (0.12, False, False), (None, False, False), (0.05, True, False)],
+)
+def test_a_piece_stands_where_the_cloud_has_it_and_the_whole_is_no_pipe(
+    at_depth: float | None, whole: bool, stands: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three standard deviations of a depth that lines tell are 9 cm; a whole that is a pipe is the answer itself."""
+    cylinder = level(0.4)
+    across = np.asarray(np.cross(cylinder.axis, np.eye(3)[1:]), np.float64)
+    piece, longer = (
+        ContourFit(each, across, np.eye(5), 1e-4, 0.9, 90.0, 20, (0.0, 0.0), 0.0, 0.1)
+        for each in (cylinder, level(0.9))
+    )
+    farther = None if at_depth is None else cylinder.shifted(np.array([0.0, at_depth, 0.0]))
+    monkeypatch.setattr(line_fitter, "at_cloud_depth", lambda *_: farther)
+    monkeypatch.setattr(LineFitter, "measure", lambda *_: longer if whole else None)
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    lines = LineFitter(views, np.zeros((0, 3), np.float32), [0.0086], boq)
+    assert lines.follow(piece, 0.0086, []) is (piece if stands else longer if whole else None)
