@@ -268,7 +268,8 @@ def _match(  # type: ignore[no-untyped-def]
     # in variables; Fuller, Measurement Error Models, 1987).
     texture = curvature - np.float32(DIFFERENCE_NOISE * SIZE) * noise * shift
     texture = max(texture, np.float32(TEXTURE_MIN) * curvature)
-    sigma = np.sqrt((noise + np.float32(NOISE * NOISE)) * curvature) / texture
+    # Sigma is that of the step as it would be without such noise: in noisy images SIGMA_MAX would leave no surface.
+    sigma = np.sqrt((noise + np.float32(NOISE * NOISE)) / curvature)
     return total / np.float32(better_half), gradient / texture, sigma
 
 
