@@ -156,7 +156,8 @@ class CandidateFitter:
                 surface = _with_surface(candidate, planned, views, others)
                 fit = _of_one_side(candidate, surface, views, others)
                 if fit is not None:
-                    moved = float(np.linalg.norm(surface.from_axis(fit.cylinder.middle[None]))) / _sigma(candidate)
+                    aside = float(np.linalg.norm(surface.from_axis(fit.cylinder.middle[None])))
+                    moved = aside * np.sin(_seen_arc(candidate).half) / _sigma(candidate)
                     if not told_by_cloud and not (moved < REACH and fit.support > CONVINCING):
                         continue
                     ranked.append((fit.log_odds - 0.5 * (misfit**2 + moved**2), fit))

@@ -97,6 +97,32 @@ def test_the_side_that_is_seen_tells_two_planned_radii_apart(
     assert CandidateFitter(_boq(0.1035), MeasurementCache()).of_visible_side(candidate, [], []) is None
 
 
+@pytest.mark.parametrize(("arc", "told"), [(70.0, None), (140.0, 0.1095)])
+def test_an_arc_tells_less_of_where_the_axis_lies_across_it(
+    arc: float, told: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A DN225 under a ceiling became a DN200, since its edge lies 8 mm beside where the surface expects it, not 5 mm.
+
+    Of 70 deg both are within two standard deviations, and the DN225 is nearer to what the cloud has.
+    """
+    cylinder = Cylinder(np.zeros(3), np.array([3.5, 0.0, 0.0]), 0.128)
+    sigma = 2.2e-3 / (1.0 - np.cos(np.radians(35.0)))  # of the radius, as for 70 deg
+    evidence = CloudEvidence(np.radians(arc), 0.98, 0.0, 2.2e-3, 3e-4, 11.0)
+    candidate = Candidate(cylinder, 2.1e-3, 50_000, evidence)
+    monkeypatch.setattr(Candidate, "arc_sigma", sigma)
+
+    def fitted(_: Candidate, known: Cylinder, *__: object) -> ContourFit:
+        aside, log_odds = (0.005, 172.0) if known.radius < 0.11 else (0.008, 170.0)
+        found = known.shifted(np.array([0.0, 0.0, aside]))
+        return ContourFit(found, np.eye(3)[1:], np.eye(5), 2e-4, 0.9, log_odds, 20, (0.0, 0.0), 0.0, 0.5)
+
+    monkeypatch.setattr(candidate_fit, "_sigma", lambda _: 2.2e-3)
+    monkeypatch.setattr(candidate_fit, "_of_one_side", fitted)
+    monkeypatch.setattr(candidate_fit, "_with_surface", lambda _, radius, *__: replace(cylinder, radius=radius))
+    fit = CandidateFitter(_boq(0.1095, 0.1223), MeasurementCache()).of_visible_side(candidate, [], [])
+    assert (fit and fit.cylinder.radius) == told
+
+
 @pytest.mark.parametrize(("thicker", "sigma"), [(0.003, 2e-4), (0.0012, 1.5e-4), (0.0005, 4e-3)])
 def test_of_one_side_the_planned_radius_near_it_is_measured(
     pipe_views: list[View], thicker: float, sigma: float
