@@ -100,13 +100,13 @@ class Search:
             consider(hypothesis)
         if self.verifier.has_views:
             for candidate in refused:
-                if self._accepts_beside([known.cylinder for known in accepted], candidate):
+                if self._accepts_beside(candidate, [known.cylinder for known in accepted]):
                     accept(candidate)
             for hypothesis in sorted(without_fit, key=lambda each: -each.votes):
                 for planned in self._at_planned_radii(hypothesis):
                     if not any(_holds(known.cylinder, planned.cylinder) for known in accepted):
                         held = fit_candidate(self.tree, free, planned, self.criteria.noise, hold_radius=True)
-                        if held is not None and self._accepts_beside([each.cylinder for each in accepted], held):
+                        if held is not None and self._accepts_beside(held, [each.cylinder for each in accepted]):
                             accept(held)
         self.report(0.8, "measuring")
         # Where the noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
@@ -128,7 +128,7 @@ class Search:
         is_piece = proposed.of_piece().accept(candidate) or proposed.of_short_piece().accept(candidate)
         return is_piece and self.verifier.verify(candidate, least)
 
-    def _accepts_beside(self, known: Sequence[Cylinder], candidate: Candidate) -> bool:
+    def _accepts_beside(self, candidate: Candidate, known: Sequence[Cylinder]) -> bool:
         """Whether the known cylinders leave enough of a candidate visible that the keyframes make a pipe of it."""
         proposed = self.criteria.relaxed(_PROPOSED_ROUGHNESS)
         return (

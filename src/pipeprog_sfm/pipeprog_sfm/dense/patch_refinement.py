@@ -218,7 +218,7 @@ def _match(  # type: ignore[no-untyped-def]
     hold four pixels each (`fours`).
     """
     one, size = np.float32(1.0), np.float32(SIZE)
-    gradient, curvature, shift = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    gradient, curvature, squared_shift = np.float32(0.0), np.float32(0.0), np.float32(0.0)
     residual, used = np.float32(0.0), 0
     height, width = neighbours.shape[1:]
     pixels = neighbours.reshape(len(neighbours), height * width)
@@ -257,7 +257,7 @@ def _match(  # type: ignore[no-untyped-def]
         gain = min(max(np.sqrt(energy / (ww + np.float32(1e-6))), np.float32(GAIN_MIN)), np.float32(GAIN_MAX))
         gradient += gain * (cp - gain * cw)
         curvature += gain * gain * cc
-        shift += gain * gain * (dx * dx + dy * dy)
+        squared_shift += gain * gain * (dx * dx + dy * dy)
         residual += energy - np.float32(2.0) * gain * wp + gain * gain * ww
         used += 1
     total = _sum_of_best(scores, better_half)
@@ -266,7 +266,7 @@ def _match(  # type: ignore[no-untyped-def]
     noise = max(residual, np.float32(0.0)) / np.float32(used * SIZE)
     # The derivatives are differences of noisy pixels: what their noise adds to the curvature shortens the step (errors
     # in variables; Fuller, Measurement Error Models, 1987).
-    texture = curvature - np.float32(DIFFERENCE_NOISE * SIZE) * noise * shift
+    texture = curvature - np.float32(DIFFERENCE_NOISE * SIZE) * noise * squared_shift
     texture = max(texture, np.float32(TEXTURE_MIN) * curvature)
     # Sigma is that of the step as it would be without such noise: in noisy images SIGMA_MAX would leave no surface.
     sigma = np.sqrt((noise + np.float32(NOISE * NOISE)) / curvature)
