@@ -18,7 +18,7 @@ from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.placed_board import PlacedBoard
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
-from pipeprog_sfm.model.bundle_adjustment import CAUCHY, rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import RAYLEIGH_MEDIAN, rotation_from_vector
 from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.model_merging import similarity_between
@@ -164,7 +164,7 @@ def _solved(
     one keyframe share the error of its pose.
     """
     middle = np.concatenate([each.points for each in sightings]).mean(0)
-    loss = CAUCHY * model.noise
+    loss = RAYLEIGH_MEDIAN * model.noise
     for _ in range(ROUNDS):
         inverse = np.asarray(np.linalg.inv(reference_from_model), np.float64)
         parts = [_linearised(model, each, inverse, middle, loss) for each in sightings]

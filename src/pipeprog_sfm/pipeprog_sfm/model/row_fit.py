@@ -10,7 +10,7 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.model.bundle_adjustment import CAUCHY, rotation_from_vector
+from pipeprog_sfm.model.bundle_adjustment import RAYLEIGH_MEDIAN, rotation_from_vector
 
 MAX_STEPS = 10  # of Gauss-Newton: it converges in three to six
 CONVERGED = 0.01  # px, root mean square of a step over the points, a thirtieth of their noise
@@ -66,7 +66,7 @@ def fit_rows(
         by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
         by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
         rows = np.concatenate([by_pose, times * by_pose], axis=2).reshape(-1, 12)
-        weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (CAUCHY * noise) ** 2) / noise**2
+        weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (RAYLEIGH_MEDIAN * noise) ** 2) / noise**2
         weighted = (np.repeat(weights, 2)[:, None] * rows).T
         information = weighted @ rows
         normal = information.copy()

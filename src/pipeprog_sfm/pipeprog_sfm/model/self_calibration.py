@@ -22,7 +22,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.model.bundle_adjustment import (
-    CAUCHY,
+    RAYLEIGH_MEDIAN,
     eliminate_points,
     factorised,
     hold_scale,
@@ -148,14 +148,14 @@ class _Problem:
     def cost(self, state: _State, told: FloatArray) -> float:
         """Half of the sum of Cauchy losses, and of the prior's squares."""
         error = self.errors(state, self.projected(state)[0])
-        robust = CAUCHY**2 * np.log1p((error**2).sum(axis=1) / CAUCHY**2).sum()
+        robust = RAYLEIGH_MEDIAN**2 * np.log1p((error**2).sum(axis=1) / RAYLEIGH_MEDIAN**2).sum()
         return 0.5 * float(robust + (((state.numbers - told) / self.prior) ** 2).sum())
 
     def linearised(self, state: _State) -> _Rows:
         """Rows at a state, with the square roots of the robust weights."""
         pixels, turned, rays = self.projected(state)
         error, camera = self.errors(state, pixels), changed(self.camera, state.numbers)
-        root = np.sqrt(1.0 / (1.0 + (error**2).sum(axis=1) / CAUCHY**2)) / self.noise
+        root = np.sqrt(1.0 / (1.0 + (error**2).sum(axis=1) / RAYLEIGH_MEDIAN**2)) / self.noise
         by_ray = _derivatives(lambda step: pixels_of(camera, rays + step), pixels, 2)
         by_focal = pixels - [camera.cx, camera.cy]  # its logarithm scales the image
         by_lens = _derivatives(lambda step: pixels_of(changed(camera, np.append(0.0, step)), rays), pixels, 2)
