@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,14 @@ _PATCH_SCALES = (0.028, 0.04, 0.056, 0.08, 0.113, 0.16, 0.02)
 _CELLS_PER_SCALE = 7.0
 # Where there are keyframes to judge it, a candidate may be twice as rough as one that the cloud alone must vouch for.
 _PROPOSED_ROUGHNESS = 2.0
-# Patch size [m] for pipes that are sought as lines: twice the thickest of these, so that they are longer than wide.
-_LINE_SCALE = 2.0 * THICKEST_LINE
+# Size of the patches in which pipes are sought as lines, in radii of the thickest, so that they are longer than wide:
+# where most are thinner, and where all are as thick. Half a barrel spreads by up to 0.7 r across, which is less than
+# half of what it does along, h / root 3, from h = 2.45 r on.
+_THIN_SCALE, _UNBENT_SCALE = 2.0, 2.5
+# Pipes of less than so many times the noise show no bend. The curvature of a patch of size h is known to 8 times the
+# noise over h^2 and the root of its independent points, some 20, as the noise of stereo is alike within a window; with
+# h = 0.7 r, that is a quarter of 1 / r, which counts as a bend, from r = 14.6 times the noise on.
+_BENT = 14.6
 
 Report = Callable[[float, str], None]
 
@@ -71,7 +78,8 @@ class Search:
         The `known` ones are measured again, and others sought among the points (N,) that are `fresh`. A candidate that
         the scene rejects (a corner, a hollow) is dropped; one too rough for the cloud alone is put to the keyframes.
         One that they refuse is put to them again once its neighbours are known, which may hide a side of it. Last come
-        hypotheses to which no fit with a free radius led, at the planned radii near them.
+        hypotheses to which no fit with a free radius led, at the planned radii near them, and planned pipes whose bend
+        the noise hides.
         """
         free = np.ones(len(self.tree.points), bool)
         accepted: list[Candidate] = []
@@ -102,12 +110,13 @@ class Search:
             for candidate in refused:
                 if self._accepts_beside(candidate, [known.cylinder for known in accepted]):
                     accept(candidate)
-            for hypothesis in sorted(without_fit, key=lambda each: -each.votes):
-                for planned in self._at_planned_radii(hypothesis):
-                    if not any(_holds(known.cylinder, planned.cylinder) for known in accepted):
-                        held = fit_candidate(self.tree, free, planned, self.criteria.noise, hold_radius=True)
-                        if held is not None and self._accepts_beside(held, [each.cylinder for each in accepted]):
-                            accept(held)
+            without_fit.sort(key=lambda each: -each.votes)
+            at_planned = (planned for hypothesis in without_fit for planned in self._at_planned_radii(hypothesis))
+            for planned in chain(at_planned, self._unbent(fresh, free)):
+                if not any(_holds(known.cylinder, planned.cylinder) for known in accepted):
+                    held = fit_candidate(self.tree, free, planned, self.criteria.noise, hold_radius=True)
+                    if held is not None and self._accepts_beside(held, [each.cylinder for each in accepted]):
+                        accept(held)
         self.report(0.8, "measuring")
         # Where the noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
         return [
@@ -129,14 +138,24 @@ class Search:
         return is_piece and self.verifier.verify(candidate, least)
 
     def _accepts_beside(self, candidate: Candidate, known: Sequence[Cylinder]) -> bool:
-        """Whether the known cylinders leave enough of a candidate visible that the keyframes make a pipe of it."""
+        """Whether the known cylinders leave enough of a candidate visible that the keyframes make a pipe of it.
+
+        One whose bend the noise hides must be visible on both sides.
+        """
         proposed = self.criteria.relaxed(_PROPOSED_ROUGHNESS)
-        return (
-            (proposed.of_held_radius() if candidate.radius_held else proposed).accept(candidate)
-            and not any(_holds(each, candidate.cylinder) for each in known)
-            and not self.around.rejects(candidate)
-            and self.verifier.verify_beside(candidate, known)
-        )
+        if (
+            not (proposed.of_held_radius() if candidate.radius_held else proposed).accept(candidate)
+            or any(_holds(each, candidate.cylinder) for each in known)
+            or self.around.rejects(candidate)
+        ):
+            return False
+        if candidate.radius_held and self._is_unbent(candidate.cylinder.radius):
+            return self.verifier.verify(candidate)
+        return self.verifier.verify_beside(candidate, known)
+
+    def _is_unbent(self, radius: float) -> bool:
+        """Whether the noise hides the bend of pipes of this radius [m], thicker ones than those of all lines."""
+        return THICKEST_LINE < radius < _BENT * self.criteria.noise
 
     def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:
         """A hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""
@@ -170,9 +189,26 @@ class Search:
             yield from axis_voting.hypotheses_of(axis_voting.patch_votes(patches, noise, self.radius_range))
         self.report(0.7, "looking for thin pipes")
         thin = [planned for planned in self.planned_radii if planned < THICKEST_LINE] or [0.5 * THICKEST_LINE]
-        patches = self._patches(free & fresh, _LINE_SCALE, 0.5 * _LINE_SCALE)
-        for line in axis_voting.hypotheses_of(axis_voting.line_votes(patches, noise, THICKEST_LINE)):
-            initial = thin_pipe_start(self.tree, free, line.cylinder, 1.2 * noise, thin)
+        yield from self._lines(fresh, free, THICKEST_LINE, _THIN_SCALE, thin)
+
+    def _unbent(self, fresh: NDArray[np.bool_], free: NDArray[np.bool_]) -> Iterator[Hypothesis]:
+        """Hypotheses at the planned radii whose bend the noise hides, of the fresh points that are free then."""
+        planned = {each for each in self.planned_radii if self._is_unbent(each)}
+        for radius in sorted(planned, reverse=True):
+            for line in self._lines(fresh, free, radius, _UNBENT_SCALE, [radius]):
+                yield replace(line, cylinder=replace(line.cylinder, radius=radius))
+
+    def _lines(
+        self, fresh: NDArray[np.bool_], free: NDArray[np.bool_], thickest: float, scale: float, radii: Sequence[float]
+    ) -> Iterator[Hypothesis]:
+        """Hypotheses, started at one of the radii, along lines of points of radius `thickest` [m] at most.
+
+        scale: of the patches that show a line, in `thickest`.
+        """
+        noise = self.criteria.noise
+        patches = self._patches(free & fresh, scale * thickest, thickest)
+        for line in axis_voting.hypotheses_of(axis_voting.line_votes(patches, noise, thickest)):
+            initial = thin_pipe_start(self.tree, free, line.cylinder, 1.2 * noise, radii)
             if initial is not None:
                 yield Hypothesis(initial, line.votes)
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.candidate_search import Search
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.acceptance import seen_from_outside
@@ -28,10 +29,14 @@ def spread_search(views: list[View], planned: float) -> Search:
     normal = np.cos(angle)[:, None] * np.cross(side, PIPE.axis) + np.sin(angle)[:, None] * side
     seen = PIPE.radius + OUTWARDS * (angle / HALF) ** 4
     points = PIPE.start + along[:, None] * PIPE.axis + seen[:, None] * normal + rng.normal(0.0, NOISE, (3000, 3))
+    return search_in(points, NOISE, views, planned)
+
+
+def search_in(points: FloatArray, noise: float, views: list[View], planned: float) -> Search:
     boq = BillOfQuantities((PipeClass("planned", planned, 3.0, (0.0, 0.0, 1.0), 4e-4),))
     tree, config = octree.build(points), DetectConfig()
-    around = SceneContext(tree, None, [], tree, NOISE)
-    criteria, verifier = seen_from_outside(NOISE, config), KeyframeVerifier(views, boq)
+    around = SceneContext(tree, None, [], tree, noise)
+    criteria, verifier = seen_from_outside(noise, config), KeyframeVerifier(views, boq)
     return Search(tree, around, criteria, (0.008, 0.2), [planned], config, verifier, lambda *_: None)
 
 
@@ -51,3 +56,25 @@ def test_at_a_planned_radius_the_keyframes_make_a_pipe_of_it(pipe_views: list[Vi
             [measured] = search.verifier.measure([candidate], [False])
             assert measured.cylinder.radius == pytest.approx(PIPE.radius, abs=2e-4)
             assert np.linalg.norm(measured.cylinder.from_axis(PIPE.middle[None])) < NOISE
+
+
+def test_a_pipe_whose_bend_the_noise_hides_is_sought_as_a_line(pipe_views: list[View], empty_views: list[View]) -> None:
+    noise = PIPE.radius / 5.0
+    rng = np.random.default_rng(0)
+    angle, along = rng.uniform(-1.2, 1.2, 3000), rng.uniform(0.0, PIPE.length, 3000)
+    side = np.cross(PIPE.axis, [0.0, -1.0, 0.0])
+    normal = np.cos(angle)[:, None] * np.cross(side, PIPE.axis) + np.sin(angle)[:, None] * side
+    points = PIPE.start + along[:, None] * PIPE.axis + (PIPE.radius + rng.normal(0.0, noise, (3000, 1))) * normal
+    for views, planned, count in (
+        (pipe_views, PIPE.radius, 1),
+        (pipe_views, 2.0 * PIPE.radius, 0),
+        (empty_views, PIPE.radius, 0),
+    ):
+        search = search_in(points, noise, views, planned)
+        every = np.ones(len(search.tree.points), bool)
+        candidates = search.candidates(every, [], [])
+        assert len(candidates) == count
+        for candidate in candidates:
+            assert candidate.cylinder.radius == PIPE.radius
+            assert np.linalg.norm(candidate.cylinder.from_axis(PIPE.middle[None])) < noise
+            assert candidate.cylinder.length == pytest.approx(PIPE.length, abs=noise)
