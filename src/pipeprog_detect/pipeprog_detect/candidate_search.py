@@ -154,8 +154,8 @@ class Search:
         return self.verifier.verify_beside(candidate, known)
 
     def _is_unbent(self, radius: float) -> bool:
-        """Whether the noise hides the bend of pipes of this radius [m], thicker ones than those of all lines."""
-        return THICKEST_LINE < radius < _BENT * self.criteria.noise
+        """Whether the noise may hide the bend of pipes of this radius [m], thicker ones than those of all lines."""
+        return THICKEST_LINE < radius < _BENT * _PROPOSED_ROUGHNESS * self.criteria.noise
 
     def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:
         """A hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""
