@@ -40,6 +40,10 @@ def contradict(candidate: Candidate, fit: ContourFit) -> bool:
 
     Where the cameras never rise or fall, the edge of the light along a pipe is taken for its contour.
     """
-    sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, fit.radius_sigma])
-    difference = abs(fit.cylinder.radius - candidate.cylinder.radius)
-    return is_resolved(candidate) and bool(difference > CONTRADICTION * sigma)
+    return excludes(candidate, fit.cylinder.radius, fit.radius_sigma)
+
+
+def excludes(candidate: Candidate, radius: float, radius_sigma: float) -> bool:
+    """Whether a cloud that resolves the section cannot have a radius [m], known to `radius_sigma` [m]."""
+    sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, radius_sigma])
+    return is_resolved(candidate) and bool(abs(radius - candidate.cylinder.radius) > CONTRADICTION * sigma)

@@ -154,6 +154,28 @@ def test_the_radius_that_one_side_does_not_tell_is_the_one_that_the_cloud_allows
     assert measured.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
 
 
+@pytest.mark.parametrize(("noise", "is_tried"), [(0.0009, False), (0.0040, True)])
+def test_a_planned_radius_that_the_cloud_excludes_is_not_taken(
+    monkeypatch: pytest.MonkeyPatch, noise: float, is_tried: bool
+) -> None:
+    """A DN225 (122.3 mm) between neighbours: one contour ends in 116.1 mm, and a DN200 has one as well supported."""
+    evidence = CloudEvidence(np.radians(155.0), 1.0, 0.0, noise, 0.0004, 800.0)
+    resolved = Candidate(replace(PIPE, radius=0.1224), 0.00046, 30_000, evidence)
+    own, other = (
+        ContourFit(
+            replace(PIPE, radius=radius), np.eye(3)[1:], np.eye(5), 2e-4, support, 150.0, 20, (0.0, 0.0), 0.0, 0.5
+        )
+        for radius, support in ((0.1161, 0.76), (0.1095, 0.62))
+    )
+    monkeypatch.setattr(
+        candidate_fit, "_at_radius", lambda _, radius, *__: other if radius == other.cylinder.radius else None
+    )
+    monkeypatch.setattr(candidate_fit, "_of_one_side", lambda *_: None)
+    fitter = CandidateFitter(_boq(0.1095, 0.1223), MeasurementCache())
+    taken = fitter.near_planned(resolved, own, [], [looking_along_y(0.0, 0)])
+    assert taken is (other if is_tried else own)
+
+
 @pytest.mark.parametrize(("arc", "support", "stands"), [(115.0, 0.6, True), (115.0, 0.4, False), (125.0, 0.4, True)])
 def test_of_a_pipe_in_a_rack_one_side_suffices(
     monkeypatch: pytest.MonkeyPatch, arc: float, support: float, stands: bool
