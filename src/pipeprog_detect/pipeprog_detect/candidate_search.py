@@ -154,7 +154,7 @@ class Search:
         return self.verifier.verify_beside(candidate, known)
 
     def _is_unbent(self, radius: float) -> bool:
-        """Whether the noise may hide the bend of pipes of this radius [m], thicker ones than those of all lines."""
+        """Whether the noise may hide the bend of pipes of this radius [m]; thinner ones are always sought as lines."""
         return THICKEST_LINE < radius < _BENT * _PROPOSED_ROUGHNESS * self.criteria.noise
 
     def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:

@@ -71,7 +71,7 @@ def _noise(errors: FloatArray) -> float:
 
 
 def _confirmed(model: SparseModel) -> NDArray[np.bool_]:
-    """(P,) points that tell poses: of LONG_TRACK views, or of a view that has few of these."""
+    """(P,) points that tell poses: of CONFIRMING views or more, or of a view that has few of these."""
     features = np.flatnonzero(model.point_of >= 0)
     point, view = model.point_of[features], model.view_of[features]
     confirmed = np.bincount(point, minlength=len(model.points)) >= CONFIRMING
