@@ -38,10 +38,10 @@ _PROPOSED_ROUGHNESS = 2.0
 # where most are thinner, and where all are as thick. Half a barrel spreads by up to 0.7 r across, which is less than
 # half of what it does along, h / root 3, from h = 2.45 r on.
 _THIN_SCALE, _UNBENT_SCALE = 2.0, 2.5
-# Pipes of less than so many times the noise show no bend. The curvature of a patch of size h is known to 8 times the
-# noise over h^2 and the root of its independent points, some 20, as the noise of stereo is alike within a window; with
-# h = 0.7 r, that is a quarter of 1 / r, which counts as a bend, from r = 14.6 times the noise on.
-_BENT = 14.6
+# The bend of a pipe shows in a patch from a radius of 14.6 times the noise on (both in m). The curvature of a patch of
+# size h is known to 8 times the noise over h^2 and the root of its independent points: some 20, as the noise of stereo
+# is alike within a window. It counts as a bend from four standard deviations on: at h = 0.7 r those are 1 / r there.
+_LEAST_BENT = 14.6
 
 Report = Callable[[float, str], None]
 
@@ -112,7 +112,7 @@ class Search:
                     accept(candidate)
             without_fit.sort(key=lambda each: -each.votes)
             at_planned = (planned for hypothesis in without_fit for planned in self._at_planned_radii(hypothesis))
-            for planned in chain(at_planned, self._unbent(fresh, free)):
+            for planned in chain(at_planned, () if sections else self._unbent(fresh, free)):
                 if not any(_holds(known.cylinder, planned.cylinder) for known in accepted):
                     held = fit_candidate(self.tree, free, planned, self.criteria.noise, hold_radius=True)
                     if held is not None and self._accepts_beside(held, [each.cylinder for each in accepted]):
@@ -155,7 +155,7 @@ class Search:
 
     def _is_unbent(self, radius: float) -> bool:
         """Whether the noise may hide the bend of pipes of this radius [m]; thinner ones are always sought as lines."""
-        return THICKEST_LINE < radius < _BENT * _PROPOSED_ROUGHNESS * self.criteria.noise
+        return THICKEST_LINE < radius < _LEAST_BENT * _PROPOSED_ROUGHNESS * self.criteria.noise
 
     def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:
         """A hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""

@@ -25,11 +25,15 @@ HALF, OUTWARDS = np.radians(37.5), 4.5e-3
 def spread_search(views: list[View], planned: float) -> Search:
     rng = np.random.default_rng(0)
     angle, along = rng.uniform(-HALF, HALF, 3000), rng.uniform(0.0, PIPE.length, 3000)
+    seen = barrel_points(angle, along, PIPE.radius + OUTWARDS * (angle / HALF) ** 4)
+    return search_in(seen + rng.normal(0.0, NOISE, (3000, 3)), NOISE, views, planned)
+
+
+def barrel_points(angle: FloatArray, along: FloatArray, distance: FloatArray) -> FloatArray:
+    """Points (N, 3) at angles (N,) [rad] from the pipe's front, distances (N,) [m] along its axis and from it."""
     side = np.cross(PIPE.axis, [0.0, -1.0, 0.0])
     normal = np.cos(angle)[:, None] * np.cross(side, PIPE.axis) + np.sin(angle)[:, None] * side
-    seen = PIPE.radius + OUTWARDS * (angle / HALF) ** 4
-    points = PIPE.start + along[:, None] * PIPE.axis + seen[:, None] * normal + rng.normal(0.0, NOISE, (3000, 3))
-    return search_in(points, NOISE, views, planned)
+    return np.asarray(PIPE.start + along[:, None] * PIPE.axis + distance[:, None] * normal, np.float64)
 
 
 def search_in(points: FloatArray, noise: float, views: list[View], planned: float) -> Search:
@@ -62,9 +66,7 @@ def test_a_pipe_whose_bend_the_noise_hides_is_sought_as_a_line(pipe_views: list[
     noise = PIPE.radius / 5.0
     rng = np.random.default_rng(0)
     angle, along = rng.uniform(-1.2, 1.2, 3000), rng.uniform(0.0, PIPE.length, 3000)
-    side = np.cross(PIPE.axis, [0.0, -1.0, 0.0])
-    normal = np.cos(angle)[:, None] * np.cross(side, PIPE.axis) + np.sin(angle)[:, None] * side
-    points = PIPE.start + along[:, None] * PIPE.axis + (PIPE.radius + rng.normal(0.0, noise, (3000, 1))) * normal
+    points = barrel_points(angle, along, PIPE.radius + rng.normal(0.0, noise, 3000))
     for views, planned, count in (
         (pipe_views, PIPE.radius, 1),
         (pipe_views, 2.0 * PIPE.radius, 0),

@@ -27,10 +27,10 @@ def adjust_model(model: SparseModel, max_iterations: int = MAX_ITERATIONS, toler
     free = np.ones(len(model), bool)
     free[:1] = False
     confirmed = _confirmed(model)
-    used = _adjust(model, free, confirmed, max_iterations, tolerance)
-    if used is None:
+    adjusted = _adjust(model, free, confirmed, max_iterations, tolerance)
+    if adjusted is None:
         return
-    model.noise = _noise(model.errors(used[2]))
+    used, model.noise = adjusted
     model.filter(*used)
     _follow(model, ~confirmed)
     model.forget_unseen()
@@ -44,9 +44,9 @@ def adjust_views(model: SparseModel, views: IntArray) -> None:
     chosen = np.zeros(len(model.points), bool)
     chosen[np.concatenate([model.seen(view) for view in views])] = True
     confirmed = _confirmed(model)
-    used = _adjust(model, free, chosen & confirmed)
-    if used is not None:
-        model.filter(*used)
+    adjusted = _adjust(model, free, chosen & confirmed)
+    if adjusted is not None:
+        model.filter(*adjusted[0])
     _follow(model, chosen & ~confirmed)
 
 
@@ -82,9 +82,9 @@ def _confirmed(model: SparseModel) -> NDArray[np.bool_]:
 
 def _follow(model: SparseModel, chosen: NDArray[np.bool_]) -> None:
     """Adjusts the chosen points (P,) bool to views that have moved."""
-    used = _adjust(model, np.zeros(len(model), bool), chosen)
-    if used is not None:
-        model.filter(*used)
+    adjusted = _adjust(model, np.zeros(len(model), bool), chosen)
+    if adjusted is not None:
+        model.filter(*adjusted[0])
 
 
 def _adjust(
@@ -93,8 +93,11 @@ def _adjust(
     chosen: NDArray[np.bool_],
     max_iterations: int = MAX_ITERATIONS,
     tolerance: float = TOLERANCE,
-) -> tuple[IntArray, IntArray, IntArray] | None:
-    """Adjusts the free views (V,) bool and the chosen points (P,) bool; returns the observations used, None without."""
+) -> tuple[tuple[IntArray, IntArray, IntArray], float] | None:
+    """Adjusts the free views (V,) bool and the chosen points (P,) bool.
+
+    Returns the observations used and the noise [px] that they tell of; None without observations.
+    """
     ids, start, features = model.observations(chosen)
     if not len(ids):
         return None
@@ -112,4 +115,4 @@ def _adjust(
             break
     model.rotation[used], model.translation[used] = bundle.rotation, bundle.translation
     model.points[ids] = bundle.points
-    return ids, start, features
+    return (ids, start, features), after

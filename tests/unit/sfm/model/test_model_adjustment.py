@@ -11,7 +11,6 @@ from pipeprog_sfm.model.model_adjustment import ENOUGH, adjust_model, adjust_vie
 from pipeprog_sfm.model.sparse_model import NONE, SparseModel
 
 SHIFT = 1.5 / FOCAL  # of a wrong match, less than what is taken for an error
-
 FEW = 20  # points of many views, beside which others may tell a pose
 
 
