@@ -67,6 +67,11 @@ class AdjustedCylinder:
         """The cylinder after the step."""
         return self.scene.cylinder
 
+    @property
+    def is_within_blur(self) -> bool:
+        """Whether its two contour lines lie within two blurs, where one edge of anything looks the same."""
+        return float(np.median(self.samples.half_width)) < self.scene.blur
+
 
 def adjusted(scene: Scene, prior: FloatArray, so_far: FloatArray) -> AdjustedCylinder | None:
     """The scene's cylinder after some passes of least squares, the edges sought anew in each; None if none is left.

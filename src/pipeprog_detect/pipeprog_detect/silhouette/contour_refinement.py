@@ -111,7 +111,7 @@ def refine(
         found = without_bend(found, start.cylinder, priors[-1])
     if found is not None and follow:
         found = followed(found, start.cylinder, priors[-1], held)
-    if found is None or found.share < MIN_SUPPORT:
+    if found is None or found.share < MIN_SUPPORT or found.is_within_blur:
         return None
     surface = start.cylinder if start.ends_known else None
     return contour_fit(found, find_ends(found.scene, surface) if follow else (None, None))

@@ -24,6 +24,11 @@ WIDTH_STEP = float(np.log(1.15))
 # Share of Schlick's reflectance that a painted or a rough metal surface keeps at grazing incidence: between none (matt)
 # and a half (gloss); the tests hold that either moves the edge by less than 0.09 px.
 RIM = 0.25
+# Prior of the model's slopes and shading, in steps between its two levels: standard deviation of what the model leaves
+# unexplained, and of a coefficient, which is some steps at the most (a slope, over 4 px). On a thin pipe, where the
+# window ends near the axis, the curves of the shading are nearly one: free coefficients of ten steps and more cancel
+# each other and move the edge by up to a pixel. There the window holds about a third of the shading.
+UNEXPLAINED, SHADING, THIN_SHADING = 0.05, 1.5, 0.3
 
 
 @dataclass(frozen=True)
@@ -60,10 +65,10 @@ class LimbEdges:
 def limb_basis(x: FloatArray, half_width: float, blur: float) -> FloatArray:
     """Model (Q, 5 or 6) at outward distances x (Q,) px from a limb of apparent radius `half_width`, blurred by `blur`.
 
-    Outside: a level and a slope; inside: a level, and the two components of a cylinder's normal, of which the one
-    towards the viewer rises as the square root of the depth (Lambert shading of a circular section). At grazing
-    incidence the surface reflects what lies just behind it (Fresnel, in Schlick's form): there the outside shows.
-    On a thin pipe the window reaches across the highlight: one more even term bends the shading.
+    Outside: a level and a slope; inside (from column 2 on): a level, and the two components of a cylinder's normal, of
+    which the one towards the viewer rises as the square root of the depth (Lambert shading of a circular section). At
+    grazing incidence the surface reflects what lies just behind it (Fresnel, in Schlick's form): there the outside
+    shows. On a thin pipe the window reaches across the highlight: one more even term bends the shading.
     """
     grid, columns = _limb_table(half_width, blur, float(np.ceil(np.abs(x).max())))
     return np.stack([np.interp(x, grid, column) for column in columns], axis=1)
@@ -96,13 +101,30 @@ def _is_thin(half_width: float) -> bool:
     return half_width * WINDOW_OF_HALF_WIDTH < INWARD
 
 
+def prior_precision(half_width: float) -> FloatArray:
+    """Precision (5 or 6,) of the prior of the coefficients of `limb_basis`, in one sample's; 0 for the levels."""
+    thin = _is_thin(half_width)
+    return _shade_precision(thin) * np.array([0.0, 1.0, 0.0, 1.0, 1.0, 1.0])[: _order(thin)]
+
+
+def _order(thin: bool) -> int:
+    """Number of columns of the limb model."""
+    return 6 if thin else 5
+
+
+def _shade_precision(thin: bool) -> float:
+    """Precision of the prior of one coefficient of slopes and shading, in those of one sample."""
+    return float((UNEXPLAINED / (THIN_SHADING if thin else SHADING)) ** 2)
+
+
 @dataclass(frozen=True)
 class _Models:
-    """Orthonormal models of profiles of Q offsets, for T trial positions of a limb, for each group of widths.
+    """Models of profiles of Q offsets as `_space` has them, for T trial positions of a limb, for each group of widths.
 
     Attributes:
         limbs: (G, Q, 6 * T) float32: column k * T + t is the k-th of the model at trial t (`limb_basis`); 0 if none.
-        smooth: (Q, 5 or 6) float32: a polynomial with as many coefficients as the limb model of the median width.
+        smooth: (Q, 5 or 6) float32: a polynomial with as many coefficients as the limb model of the median width, and
+            with as strong a prior.
         group: (N,) of each profile.
     """
 
@@ -116,7 +138,7 @@ class _Models:
         keys, group = np.unique(np.round(np.log(np.maximum(half_width, 1.0)) / WIDTH_STEP), return_inverse=True)
         at, positions = tuple(offsets.tolist()), tuple(trials.tolist())
         limbs = [_limb_spaces(float(np.exp(key * WIDTH_STEP)), blur, at, positions) for key in keys]
-        smooth = _smooth_space(6 if _is_thin(float(np.median(half_width))) else 5, at)
+        smooth = _smooth_space(_is_thin(float(np.median(half_width))), at)
         return cls(np.stack(limbs), smooth, group.astype(np.int64))
 
 
@@ -124,19 +146,33 @@ class _Models:
 def _limb_spaces(
     width: float, blur: float, offsets: tuple[float, ...], trials: tuple[float, ...]
 ) -> NDArray[np.float32]:
-    """Orthonormal bases (Q, 6 * T) of the limb model at offsets (Q,) px for each trial position (T,)."""
+    """Spaces (Q, 6 * T) of the limb model at offsets (Q,) px for each trial position (T,)."""
     away = np.subtract.outer(np.array(trials), np.array(offsets))
     model = limb_basis(-away.ravel(), width, blur).reshape(*away.shape, -1)
     basis = np.zeros((len(offsets), 6, len(trials)), np.float32)
-    basis[:, : model.shape[2]] = np.linalg.qr(model)[0].transpose(1, 2, 0)
+    basis[:, : model.shape[2]] = _space(model, prior_precision(width)).transpose(1, 2, 0)
     return basis.reshape(len(offsets), -1)
 
 
 @lru_cache(maxsize=256)
-def _smooth_space(order: int, offsets: tuple[float, ...]) -> NDArray[np.float32]:
-    """Orthonormal basis (Q, order) of polynomials at offsets (Q,) px."""
+def _smooth_space(thin: bool, offsets: tuple[float, ...]) -> NDArray[np.float32]:
+    """Space (Q, 5 or 6) of polynomials at offsets (Q,) px; all powers but the level have the prior of the shading."""
     at = np.array(offsets)
-    return np.ascontiguousarray(np.linalg.qr(np.vander(at / np.abs(at).max(), order))[0], np.float32)
+    powers = np.vander(at / np.abs(at).max(), _order(thin), increasing=True)
+    precision = np.full(_order(thin), _shade_precision(thin))
+    precision[0] = 0.0
+    return np.ascontiguousarray(_space(powers, precision), np.float32)
+
+
+def _space(models: FloatArray, precision: FloatArray) -> FloatArray:
+    """Vectors (..., Q, K) for models (..., Q, K): a profile's squares less those of its products with them is its cost.
+
+    That is the least sum of the squares of the residuals and, times their `precision` (K,), of the coefficients (ridge
+    regression, Hoerl and Kennard 1970): the prior is further rows of the model, where the profile is 0.
+    """
+    rows = np.broadcast_to(np.diag(np.sqrt(precision)), (*models.shape[:-2], len(precision), len(precision)))
+    basis: FloatArray = np.linalg.qr(np.concatenate([models, rows], axis=-2))[0][..., : models.shape[-2], :]
+    return basis
 
 
 def least_cost(

@@ -13,7 +13,7 @@ from pipeprog_detect.silhouette import contour_adjustment, global_search
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples, ViewArrays, in_image
 from pipeprog_detect.silhouette.contour_adjustment import FIRST_OFFSET, FLOOR, LEAST_OFFSET, ROBUST, ROUNDS, WORST_EDGE
 from pipeprog_detect.silhouette.light_sampling import LINEAR_LIGHT, light_across, light_at
-from pipeprog_detect.silhouette.limb_edges import LimbEdges, least_cost, limb_basis, limb_edges
+from pipeprog_detect.silhouette.limb_edges import LimbEdges, least_cost, limb_basis, limb_edges, prior_precision
 from pipeprog_detect.silhouette.occlusion import (
     BEFORE,
     MARGIN,
@@ -69,9 +69,13 @@ def test_limb_costs_are_those_of_least_squares(half_width: float) -> None:
     offsets, trials, blur = np.arange(-9.0, 3.5, 0.5, dtype=float), np.arange(-0.8, 0.81, 0.2, dtype=float), 0.6
     width = float(np.exp(np.round(np.log(half_width) / np.log(1.15)) * np.log(1.15)))
     light: FloatArray = 90.0 + np.cumsum(RANDOM.normal(0.0, 5.0, (40, len(offsets))), axis=1).astype(float)
-    expected = [[_left(limb_basis(offsets - trial, width, blur), profile) for trial in trials] for profile in light]
-    order = limb_basis(offsets, width, blur).shape[1]
-    smooth = [_left(np.vander(offsets / 9.0, order).astype(float), profile) for profile in light]
+    prior = prior_precision(width)
+    expected = [
+        [_left(limb_basis(offsets - trial, width, blur), profile, prior) for trial in trials] for profile in light
+    ]
+    powers: FloatArray = np.vander(offsets / 9.0, len(prior), increasing=True).astype(float)
+    shades = np.append(0.0, np.full(len(prior) - 1, prior.max()))
+    smooth = [_left(powers, profile, shades) for profile in light]
     cost, plain = least_cost(light.astype(np.float32), offsets, np.full(40, half_width), blur, trials)
     np.testing.assert_allclose(cost, np.min(expected, axis=1), rtol=2e-3, atol=0.05)
     np.testing.assert_allclose(plain, smooth, rtol=2e-3, atol=0.05)
@@ -84,7 +88,8 @@ def test_edges_are_the_deepest_minima_with_the_deepest_first() -> None:
     trials = np.arange(-1.5, 1.55, 0.1)
     width = float(np.exp(np.round(np.log(20.0) / np.log(1.15)) * np.log(1.15)))
     for row, profile in enumerate(light):
-        cost = np.array([_left(limb_basis(offsets - trial, width, 0.6), profile) for trial in trials])
+        left = [_left(limb_basis(offsets - trial, width, 0.6), profile, prior_precision(width)) for trial in trials]
+        cost = np.array(left)
         lowest = [t for t in range(1, len(trials) - 1) if cost[t] < min(cost[t - 1], cost[t + 1])]
         lowest = sorted(lowest, key=lambda t: float(cost[t]))[:3]
         assert np.isfinite(found.offset[row]).sum() == len(lowest)
@@ -92,9 +97,10 @@ def test_edges_are_the_deepest_minima_with_the_deepest_first() -> None:
         assert (np.diff(found.explained[row, : len(lowest)]) <= 1e-6).all()
 
 
-def _left(model: FloatArray, profile: FloatArray) -> float:
-    """What least squares leave of the squares."""
-    return float(((profile - model @ np.linalg.lstsq(model, profile, rcond=None)[0]) ** 2).sum())
+def _left(model: FloatArray, profile: FloatArray, precision: FloatArray) -> float:
+    """The least sum of the squares of the residuals and of the coefficients times their precision."""
+    best = np.linalg.solve(model.T @ model + np.diag(precision), model.T @ profile)
+    return float(((profile - model @ best) ** 2).sum() + precision @ best**2)
 
 
 def test_scores_are_sums_of_linear_interpolation() -> None:

@@ -95,9 +95,11 @@ def test_the_blur_of_views_is_measured_unless_it_is_known(pipe_views: list[View]
     # Blurs are tried in steps of a fifth.
     assert measured.blur == pytest.approx(np.hypot(sharp.blur, 1.2), rel=0.2)
     assert told.blur == 1.35
-    # On a contour whose own blur is not measured, the views' one shows more edges than a sharp image's.
-    as_sharp, as_blurred = (Scene.of(PIPE, views, []).support().hits.sum() for views in (blurred, known))
-    assert as_blurred > 1.1 * as_sharp
+    # On a contour whose own blur is not measured, the views' one places its edges better than a sharp image's.
+    as_sharp, as_blurred = (
+        np.median(Scene.of(PIPE, views, []).edges(1.5)[1].sigma[:, 0]) for views in (blurred, known)
+    )
+    assert as_blurred < 0.5 * as_sharp
 
 
 def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
@@ -122,25 +124,18 @@ def test_hidden_samples_are_left_out(pipe_views: list[View]) -> None:
 
 
 @pytest.mark.parametrize("radius_known", [True, False])
-@pytest.mark.parametrize(("aside", "on_an_edge"), [(0.0, False), (0.02, False), (0.04, True)])
-def test_no_radius_is_below_zero_where_edges_of_texture_pull_it(
-    empty_views: list[View], pipe_views: list[View], radius_known: bool, aside: float, on_an_edge: bool
+@pytest.mark.parametrize("aside", [0.0, 0.02, 0.04])
+def test_a_cylinder_thinner_than_a_pixel_is_measured_nowhere(
+    empty_views: list[View], pipe_views: list[View], radius_known: bool, aside: float
 ) -> None:
-    """A cylinder thinner than a pixel is measured nowhere on plain texture.
-
-    On the pipe's contour (0.04 m aside) it may take this edge or none: rounding decides which.
-    """
+    """Neither on texture nor on one edge, the pipe's contour or its shadow's (0.04 m aside)."""
     place = np.array([aside, 0.0, 0.1])
     radii = (0.3e-3, 0.6e-3, 1e-3)
     threads = [Cylinder(PIPE.start + place, PIPE.end + place - [0.0, 0.0, 0.2], radius) for radius in radii]
-    fits = [
-        [refine(Start(thread, thread.radius, radius_known, 0.03), views, [], [thread.radius]) for thread in threads]
-        for views in (empty_views, pipe_views)
-    ]
-    assert fits[0] == [None, None, None]
-    found = [fit.cylinder.radius for fit in fits[1] if fit is not None]
-    assert bool(found) == on_an_edge
-    assert all(radius > 0 for radius in found)
+    for views in (empty_views, pipe_views):
+        for thread in threads:
+            fit = refine(Start(thread, thread.radius, radius_known, 0.03), views, [], [thread.radius])
+            assert fit is None
 
 
 def test_a_glimpse_of_a_pipe_does_not_measure_it(pipe_views: list[View]) -> None:

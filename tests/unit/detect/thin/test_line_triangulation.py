@@ -76,7 +76,7 @@ def test_the_contour_of_a_strip_stays_where_it_is(pipe_views: list[View]) -> Non
     up = np.array([0.0, 0.0, 0.2])
     strip = refine(Start(Cylinder(at - up, at + up, SHADOW_RADIUS), 0.002), pipe_views, [PIPE])
     assert strip is not None
-    assert abs(strip.flatness - FLAT) < strip.flatness_sigma, "soft edges: the walk tells half of it"
+    assert FLAT < strip.flatness < 1.0 + strip.flatness_sigma, "soft edges: the walk tells most of it"
     assert strip.flatness - pipe.flatness > SURELY * np.hypot(strip.flatness_sigma, pipe.flatness_sigma)
 
 
