@@ -24,6 +24,8 @@ FACE = (4.0, 8.0)
 SHOWN = 0.2
 # Distance before and behind a proposed axis in which the cloud counts [m].
 DEPTH_REACH = 0.3
+# Largest gap [m] between pieces of one pipe: what crosses before it hides it so far.
+GAP = 0.3
 # Along the lines of sight to a thin pipe the cloud shows more of the wall than of it: this percentile of the depths is
 # still its own.
 FRONT = 10.0
@@ -37,19 +39,21 @@ def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
     return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
 
 
-def covers(one: Cylinder, other: Cylinder, centre: FloatArray, radii: float) -> bool:
+def covers(one: Cylinder, other: Cylinder, centre: FloatArray, radii: float, common: float = -GAP) -> bool:
     """Whether two cylinders look, from `centre`, like pieces of one: their depths are what is known worst.
 
-    Their lines of sight may pass each other at up to `radii` radii of the first.
+    Their lines of sight may pass each other at up to `radii` radii of the first. They have more than the length
+    `common` [m] in common, at the distance of the first; a negative one is a gap between them.
     """
     axis, towards, side = _sight(one, centre)
     ends = np.stack([other.start, other.end]) - centre
     depth = float((one.start - centre) @ towards)
     place = (ends @ axis) * depth / (ends @ towards) - float((one.start - centre) @ axis)
     aside = (ends @ side) * depth / (ends @ towards)
-    gap = max(float(place.min()) - one.length, -float(place.max()))
+    low, high = float(place.min()), float(place.max())
     in_front = float((ends @ towards).min()) > 0.5 * depth
-    return in_front and float(np.abs(aside).max()) < radii * one.radius and gap < 0.3
+    longer = min(high, one.length) - max(low, 0.0) > common
+    return in_front and longer and float(np.abs(aside).max()) < radii * one.radius
 
 
 def extended_to(one: Cylinder, other: Cylinder, centre: FloatArray) -> Cylinder:

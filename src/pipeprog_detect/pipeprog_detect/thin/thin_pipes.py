@@ -31,8 +31,9 @@ from pipeprog_detect.verification.scene_context import SceneContext
 MOST_PROPOSED, MOST_POINTS = 40, 600_000
 # A line that walls and pipes would hide along more than half of its length was put at a wrong depth or slope.
 MOSTLY_SEEN = 0.5
-# The axes of pipes side by side are at least two radii apart.
-TOUCHING = 2.0
+# Lines of sight that pass each other at less than these radii: the axes of pipes side by side are two radii apart, and
+# what goes on along one line is one pipe.
+TOUCHING, SAME_LINE = 2.0, 1.0
 # Their axes are known to this [m].
 AXIS_SIGMA = 1e-3
 
@@ -69,10 +70,14 @@ def find_thin_pipes(
     thin: list[MeasuredPipe] = []
 
     def is_rival(cylinder: Cylinder) -> bool:
-        """Whether the views show it where they show a thin pipe: only one can be there."""
+        """Whether the views show it, or most of it, where they show a thin pipe: only one can be there."""
         centre = mean_centre(cylinder, views)
-        narrow = [each for each in known if each.radius < thickest]
-        return centre is not None and any(covers(each, cylinder, centre, TOUCHING) for each in narrow)
+        most = 0.5 * cylinder.length
+        return centre is not None and any(
+            covers(each, cylinder, centre, SAME_LINE) or covers(each, cylinder, centre, TOUCHING, most)
+            for each in known
+            if each.radius < thickest
+        )
 
     def is_no_pipe(cylinder: Cylinder) -> bool:
         """Whether it is a line on a wall, or looks like the one in which two walls meet."""

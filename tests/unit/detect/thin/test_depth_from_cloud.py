@@ -112,3 +112,14 @@ def test_lines_are_pieces_of_one_pipe_by_what_the_image_shows(radii: float, fart
     assume(min(abs(abs(radii) - SAME_LINE), abs(abs(radii) - 2.0), abs(ahead - 0.9)) > 1e-9)  # rounding
     for allowed in (SAME_LINE, 2.0):
         assert covers(one, other, centre, allowed) == (abs(radii) < allowed and ahead < 0.9)
+
+
+def test_cylinders_that_pass_each_other_have_what_both_show_in_common() -> None:
+    """Two pipes side by side, one behind the other, of which the second begins 0.55 m before the first one ends."""
+    centre = np.array([2.0, -2.5, 0.0])
+    one = Cylinder(np.array([0.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0]), 0.0086)
+    other = Cylinder(np.array([2.45, 0.0, 0.015]), np.array([5.45, 0.0, 0.015]), 0.0086)
+    assert covers(one, other, centre, 2.0)
+    assert covers(one, other, centre, 2.0, 0.5)
+    assert not covers(one, other, centre, 2.0, 0.6)
+    assert not covers(one, other, centre, 1.0)
