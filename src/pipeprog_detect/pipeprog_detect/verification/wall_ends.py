@@ -13,6 +13,7 @@ from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.axial_evidence import axial_evidence
+from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -42,6 +43,7 @@ def with_ends_on_walls(
 
     Prior: ends occur along a pipe as a Poisson process with one end per measured length. Where the keyframes do not
     show that the pipe stops before a plane, it is the more probable that it goes on to the plane the nearer that is.
+    Where they see through what is between, the edges there are of something else in line with the pipe.
     A part that lies behind a plane as seen from every camera, and that the plane surrounds, was not seen: it is cut.
 
     Args:
@@ -55,7 +57,10 @@ def with_ends_on_walls(
     for at_end in (False, True):
         end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
         nearest = min(planes_ahead(cylinder, at_end, context, views), default=0.0)
-        if nearest > 0.0 and not _goes_on(cylinder, at_end, rims[at_end], nearest, views, others):
+        if nearest > 0.0 and (
+            not _goes_on(cylinder, at_end, rims[at_end], nearest, views, others)
+            or free_stretches(Cylinder(end, end + nearest * out, cylinder.radius), views, others, cylinder)
+        ):
             nearest = 0.0
         ends.append(end + nearest * out)
     return Cylinder(ends[0], ends[1], cylinder.radius)

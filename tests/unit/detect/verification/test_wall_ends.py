@@ -9,10 +9,11 @@ import pytest
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import with_ends_on_walls
-from tests.unit.detect.pipe_and_wall import PIPE
+from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
 
 NO_RIMS = (0.0, 0.0)
 TOLERANCE = 1e-3
@@ -58,6 +59,16 @@ def test_a_pipe_of_which_the_lower_part_was_not_found_goes_on_to_the_floor(pipe_
     longer = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.2), pipe_views, [])
     assert height_of_start(longer) == pytest.approx(-0.2, abs=TOLERANCE)
     np.testing.assert_allclose(longer.end, PIPE.end)
+
+
+def test_a_pipe_does_not_go_on_to_a_floor_where_the_views_see_through_what_is_between(pipe_views: list[View]) -> None:
+    """What has edges there, in line with a pipe whose cloud has no holes, is another thing."""
+    surface = front_points(PIPE)
+    above = surface[(surface - PIPE.start) @ PIPE.axis > 0.1]
+    for barrel, end in ((surface, -0.2), (above, -0.1)):
+        views = with_depths(pipe_views, np.concatenate([wall_points(), barrel]))
+        longer = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.2), views, [])
+        assert height_of_start(longer) == pytest.approx(end, abs=TOLERANCE)
 
 
 def test_what_is_hidden_goes_on_to_a_floor_that_is_near(pipe_views: list[View]) -> None:
