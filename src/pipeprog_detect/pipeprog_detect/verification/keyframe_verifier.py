@@ -11,6 +11,7 @@ import numpy as np
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.apparent_contour import views_showing
+from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.extension import LEAST_STUB
 from pipeprog_detect.silhouette.free_space import free_stretches
@@ -26,7 +27,7 @@ from pipeprog_detect.verification.radius_agreement import agree, contradict, is_
 FEW_VIEWS = 30
 # Points along an axis by which the views that show it are found.
 AXIS_POINTS = 9
-# A candidate is verified once: another one within this share of its radius and length gets the same answer.
+# A candidate that is refused is measured once: another one within this share of its radius and length has its contour.
 SAME = 0.1
 
 
@@ -36,7 +37,7 @@ class KeyframeVerifier:
     def __init__(self, views: Sequence[View], boq: BillOfQuantities, cache: MeasurementCache | None = None) -> None:
         self._views = views
         self._fitter = CandidateFitter(boq, cache or MeasurementCache())
-        self._refused: list[Cylinder] = []
+        self._refused: list[tuple[Cylinder, ContourFit | None]] = []
 
     @property
     def has_views(self) -> bool:
@@ -56,9 +57,25 @@ class KeyframeVerifier:
         `least_length` [m]: they must show it as long as that, however much of it the cloud has (a smooth white pipe
         gives stereo points at its ends alone).
         """
-        cylinder = candidate.cylinder
-        if not self.has_views or any(_resembles(cylinder, refused) for refused in self._refused):
+        if not self.has_views:
             return False
+        fit = self._fit_of(candidate)
+        if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
+            self._refused.append((candidate.cylinder, fit))
+            return False
+        if candidate.cylinder.length < least_length:
+            whole = self._fitter.fit(candidate, [], self._views)
+            if whole is None or whole.cylinder.length < least_length:
+                self._refused.append((candidate.cylinder, None))
+                return False
+        return True
+
+    def _fit_of(self, candidate: Candidate) -> ContourFit | None:
+        """The contour of a candidate; the same one where another candidate so near to it was refused."""
+        cylinder = candidate.cylinder
+        for refused, fit in self._refused:
+            if _resembles(cylinder, refused):
+                return fit
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
         fit = self._fitter.fit(candidate, [], views, follow=False)
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
@@ -66,15 +83,7 @@ class KeyframeVerifier:
             fit = self._fitter.of_planned_radius(candidate, [], self._views)
         if fit is None and is_resolved(candidate):
             fit = self._fitter.of_visible_side(candidate, [], self._views)
-        if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
-            self._refused.append(cylinder)
-            return False
-        if cylinder.length < least_length:
-            whole = self._fitter.fit(candidate, [], views)
-            if whole is None or whole.cylinder.length < least_length:
-                self._refused.append(cylinder)
-                return False
-        return True
+        return fit
 
     def verify_beside(self, candidate: Candidate, others: Sequence[Cylinder]) -> bool:
         """Whether the keyframes make a pipe of a candidate by what the others leave visible of it.
@@ -82,13 +91,13 @@ class KeyframeVerifier:
         Its radius was held, or they hide one side of it: where both are visible, `verify` tells.
         """
         if candidate.radius_held:
-            if any(_resembles(candidate.cylinder, refused) for refused in self._refused):
+            if any(_resembles(candidate.cylinder, refused) for refused, _ in self._refused):
                 return False
         elif only_visible_side(Scene.of(candidate.cylinder, self._views, others)) is None:
             return False
         stands = self._fitter.of_visible_side(candidate, others, self._views) is not None
         if not stands:
-            self._refused.append(candidate.cylinder)
+            self._refused.append((candidate.cylinder, None))
         return stands
 
     def measure(self, candidates: Sequence[Candidate], trusted: Sequence[bool]) -> list[MeasuredPipe]:
