@@ -184,9 +184,8 @@ class CandidateFitter:
         """Where the contour is sought: at the candidate's radius, and at planned ones if the cloud leaves it open."""
         sigma, cylinder = _sigma(candidate), candidate.cylinder
         seen = SeenArc(candidate.evidence.arc, sigma) if trusted and not candidate.blurred else None
-        radii = [cylinder.radius]
-        if candidate.blurred:
-            radii += self._within_reach(candidate)
+        planned = self._within_reach(candidate) if candidate.blurred or candidate.radius_held else []
+        radii = dict.fromkeys([cylinder.radius, *planned])  # a radius that is held is a planned one
         return [Start(replace(cylinder, radius=radius), sigma, ends_known=True, seen=seen) for radius in radii]
 
 

@@ -73,6 +73,19 @@ def test_a_radius_that_was_given_to_a_candidate_is_no_observation(pipe_views: li
     assert measured.cylinder.radius == pytest.approx(true.radius, abs=1e-4)
 
 
+def test_where_the_noise_hides_the_bend_all_planned_radii_are_tried(pipe_views: list[View]) -> None:
+    """A line of points in a rough cloud was given two and a half times the radius."""
+    pipe = pipe_and_wall.PIPE
+    classes = tuple(PipeClass(f"R{radius}", radius, 3.0, (0.0, 0.0, 1.0), 4e-4) for radius in (pipe.radius, 0.1))
+    behind = np.array([0.0, pipe.radius, 0.0])
+    given = Cylinder(pipe.start + behind, pipe.end + behind, 0.1)
+    evidence = CloudEvidence(np.radians(70.0), 0.9, 0.0, 0.01, 0.0, 9.0)
+    fitter = CandidateFitter(BillOfQuantities(classes), MeasurementCache())
+    fit = fitter.fit(Candidate(given, 0.06, 900, evidence, radius_held=True), [], pipe_views)
+    assert fit is not None
+    assert fit.cylinder.radius == pytest.approx(pipe.radius, abs=1e-3)
+
+
 @pytest.mark.parametrize(("odds", "told"), [(190.0, 0.1095), (90.0, None), (80.0, 0.1223)])
 def test_the_side_that_is_seen_tells_two_planned_radii_apart(
     odds: float, told: float | None, monkeypatch: pytest.MonkeyPatch
