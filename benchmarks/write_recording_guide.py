@@ -31,7 +31,6 @@ ADVICE = {
     "speed [m/s], phone with 4 ms and 15 ms": (
         "Walk at up to 0.75 m/s, slower where the exposure is longer than 4 ms.",
         "The phone of this table exposes for 4 ms and reads a frame out in 15 ms, which is not told.\n"
-        "The table is older than what takes the read-out from the images (see the rolling shutter below).\n"
         "Blur grows with speed times exposure, skew with speed times read-out time, and a fast walk has fewer views of "
         "each pipe.",
     ),
@@ -39,9 +38,7 @@ ADVICE = {
         "Fix the exposure at 1/500 s or less; bring light rather than expose longer.",
         "Blur along the walk widens the edges that lie across it.\n"
         "Undoing it (`--set sfm.deblur.exposure=0.008`, where the exposure is known) has helped only after jolts: see "
-        "[deblurring](results/deblur.md).\n"
-        "At 12 ms the pipe that is not found is the one of 8.6 mm: a third of the samples of its true contour show an "
-        "edge, where of texture a fifth do.",
+        "[deblurring](results/deblur.md).",
     ),
     "image noise [grey levels]": (
         "Rather noise than blur: raise the gain before the exposure time.",
