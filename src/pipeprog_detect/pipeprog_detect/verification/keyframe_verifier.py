@@ -59,24 +59,25 @@ class KeyframeVerifier:
         """
         if not self.has_views:
             return False
-        fit = self._fit_of(candidate)
-        if fit is None or not self._fitter.is_planned(fit) or not (fit.support > CONVINCING or agree(candidate, fit)):
-            self._refused.append((candidate.cylinder, fit))
-            return False
-        if candidate.cylinder.length < least_length:
-            whole = self._fitter.fit(candidate, [], self._views)
-            if whole is None or whole.cylinder.length < least_length:
-                self._refused.append((candidate.cylinder, None))
-                return False
-        return True
-
-    def _fit_of(self, candidate: Candidate) -> ContourFit | None:
-        """The contour of a candidate; the same one where another candidate so near to it was refused."""
         cylinder = candidate.cylinder
-        for refused, fit in self._refused:
-            if _resembles(cylinder, refused):
-                return fit
         views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
+        known = next((each for each in self._refused if _resembles(cylinder, each[0])), None)
+        fit = self._contour(candidate, views) if known is None else known[1]
+        stands = fit is not None and self._stands(candidate, fit)
+        if stands and cylinder.length < least_length:
+            whole = self._fitter.fit(candidate, [], views)
+            stands = whole is not None and whole.cylinder.length >= least_length
+            fit = fit if stands else None
+        if not stands and known is None:
+            self._refused.append((cylinder, fit))
+        return stands
+
+    def _stands(self, candidate: Candidate, fit: ContourFit) -> bool:
+        """Whether a contour makes a pipe of a candidate: see `verify`."""
+        return self._fitter.is_planned(fit) and (fit.support > CONVINCING or agree(candidate, fit))
+
+    def _contour(self, candidate: Candidate, views: Sequence[View]) -> ContourFit | None:
+        """The contour of a candidate in `views`, between the ends that it has."""
         fit = self._fitter.fit(candidate, [], views, follow=False)
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
         if candidate.blurred and (fit is None or not self._fitter.is_planned(fit)):

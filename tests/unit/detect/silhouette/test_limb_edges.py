@@ -52,7 +52,7 @@ def test_gradient_would_be_biased_where_the_limb_model_is_not() -> None:
 
 @pytest.mark.parametrize("aside", [-0.8, 0.0, 0.8])
 @pytest.mark.parametrize("outside", [20.0, 180.0])
-def test_shading_does_not_move_the_edge_of_a_thin_pipe(outside: float, aside: float) -> None:
+def test_shading_hardly_moves_the_edge_of_a_thin_pipe(outside: float, aside: float) -> None:
     """A lamp aside shades a pipe 8 px wide by a skew curve, which fitted freely takes other places for the edge.
 
     Held by its prior it moves the edge by a quarter of a pixel at the most.
