@@ -14,7 +14,7 @@ from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.scene import Scene
-from pipeprog_detect.thin.axis_sweep import propose_parallel
+from pipeprog_detect.thin.axis_sweep import SAME_LINE, propose_parallel
 from pipeprog_detect.thin.corners import is_corner
 from pipeprog_detect.thin.depth_from_cloud import covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_bare, is_false_line
@@ -31,9 +31,8 @@ from pipeprog_detect.verification.scene_context import SceneContext
 MOST_PROPOSED, MOST_POINTS = 40, 600_000
 # A line that walls and pipes would hide along more than half of its length was put at a wrong depth or slope.
 MOSTLY_SEEN = 0.5
-# Lines of sight that pass each other at less than these radii: the axes of pipes side by side are two radii apart, and
-# what goes on along one line is one pipe.
-TOUCHING, SAME_LINE = 2.0, 1.0
+# The axes of pipes side by side are at least two radii apart.
+TOUCHING = 2.0
 # Their axes are known to this [m].
 AXIS_SIGMA = 1e-3
 

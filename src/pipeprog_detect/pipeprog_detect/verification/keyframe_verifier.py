@@ -60,12 +60,11 @@ class KeyframeVerifier:
         if not self.has_views:
             return False
         cylinder = candidate.cylinder
-        views = views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
         known = next((each for each in self._refused if _resembles(cylinder, each[0])), None)
-        fit = self._contour(candidate, views) if known is None else known[1]
+        fit = self._contour(candidate) if known is None else known[1]
         stands = fit is not None and self._stands(candidate, fit)
         if stands and cylinder.length < least_length:
-            whole = self._fitter.fit(candidate, [], views)
+            whole = self._fitter.fit(candidate, [], self._few_views(cylinder))
             stands = whole is not None and whole.cylinder.length >= least_length
             fit = fit if stands else None
         if not stands and known is None:
@@ -76,9 +75,13 @@ class KeyframeVerifier:
         """Whether a contour makes a pipe of a candidate: see `verify`."""
         return self._fitter.is_planned(fit) and (fit.support > CONVINCING or agree(candidate, fit))
 
-    def _contour(self, candidate: Candidate, views: Sequence[View]) -> ContourFit | None:
-        """The contour of a candidate in `views`, between the ends that it has."""
-        fit = self._fitter.fit(candidate, [], views, follow=False)
+    def _few_views(self, cylinder: Cylinder) -> list[View]:
+        """Keyframes that show a cylinder, as many as suffice to verify it."""
+        return views_showing(cylinder.at(np.linspace(0.0, 1.0, AXIS_POINTS)), self._views, FEW_VIEWS)
+
+    def _contour(self, candidate: Candidate) -> ContourFit | None:
+        """The contour of a candidate, between the ends that it has."""
+        fit = self._fitter.fit(candidate, [], self._few_views(candidate.cylinder), follow=False)
         fit = self._fitter.near_planned(candidate, fit, [], self._views)
         if candidate.blurred and (fit is None or not self._fitter.is_planned(fit)):
             fit = self._fitter.of_planned_radius(candidate, [], self._views)
