@@ -13,14 +13,16 @@ from pipeprog_sfm.sparse.registration import LOCAL_WINDOW, MIN_INLIERS, Location
 from pipeprog_sfm.sparse.sparse_map import SparseMap
 
 DEPTH_TOLERANCE = 0.05  # relative difference of a point's depth in two models: its noise at the smallest ray angle
+CONFIRMED = 3  # views of a model that is merged: nothing confirms a pair, which a read-out not known may have bent
 AGREEING = 0.5  # share of the points of two models whose depths agree: with fewer one of the models is bent
 
 
 def merge_models(sparse_map: SparseMap, localizer: Localizer, stamp: int) -> list[int]:
     """Merges the keyframe's model with another one in which the keyframe can be located as well.
 
-    Of two models that see the same points at other depths the smaller one, made of fewer views, is given up. Returns
-    the stamps of its keyframes, which wait to be registered anew; mostly none.
+    Of two models that see the same points at other depths the smaller one, made of fewer views, is given up; so is a
+    pair that no third view has confirmed. Returns the stamps of its keyframes, which wait to be registered anew; mostly
+    none.
     """
     own = sparse_map.model_of(stamp)
     if own is None:
@@ -33,12 +35,13 @@ def merge_models(sparse_map: SparseMap, localizer: Localizer, stamp: int) -> lis
         location = localizer.locate_by(other, keyframe, similar)
         view = own.stamps.index(stamp)
         found = similarity_between(own, view, other, location)
-        if found is not None:
+        is_confirmed = min(len(own), len(other)) >= CONFIRMED
+        if found is not None and is_confirmed:
             removed, merged = merge(own, other, *found)
             sparse_map.models = [model for model in sparse_map.models if model is not removed]
             _connect(sparse_map, removed, merged, stamp)
             return []
-        if len(_depths(own, view, other, location)) >= MIN_INLIERS / AGREEING:
+        if found is not None or len(_depths(own, view, other, location)) >= MIN_INLIERS / AGREEING:
             return sparse_map.give_up(min(own, other, key=len))
     return []
 
