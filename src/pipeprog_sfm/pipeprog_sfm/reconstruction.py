@@ -331,7 +331,9 @@ class Reconstruction:
         if found.camera != found.told:
             measured = measured.remeasured(((stamp, image.gray()) for stamp, image in images.items()), found.camera)
         model = self._map.published
-        rolling, other = (_rolling(model, self._map.motions(model, each)) for each in (None, found.readout))
+        rolling, other = (
+            _rolling(model, self._map.spline_motions(model, each)) for each in (self._map.readout, found.readout)
+        )
         before = self._metric_tracker.board_misfit(poses, rolling)
         if not board_agrees(before, measured.board_misfit(found.poses, other)):
             return False

@@ -19,15 +19,36 @@ MIN_POINTS = 50  # of a view, from which its own rows tell its velocity: twelve 
 
 @dataclass(frozen=True)
 class RowFit:
-    """The motion that fits a view's rows best.
+    """The motion that fits a view's rows best, with another one as the prior.
 
-    moved (6,): by how much it differs from the prior, angular (rad/s) and linear (units of the model per second).
-    sigmas (6,): standard deviations of its velocities if there were no prior.
+    Attributes:
+        prior: motion expected.
+        moved: (6,) by how much the one that fits differs, angular (rad/s) and linear (units of the model per second).
+        information: (6, 6) of the rows on these.
+        precision: (6,) of the prior, for a standard deviation of one.
+        sigma: the prior's standard deviation, rad/s, and depths of the scene per second.
     """
 
-    motion: RowMotion
+    prior: RowMotion
     moved: FloatArray
-    sigmas: FloatArray
+    information: FloatArray
+    precision: FloatArray
+    sigma: float
+
+    @property
+    def motion(self) -> RowMotion:
+        """The one that fits."""
+        return _changed(self.prior, self.moved)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(6,) standard deviations of its velocities if there were no prior."""
+        return np.sqrt(np.diag(np.linalg.pinv(self.information)))
+
+    def held_to(self, sigma: float) -> RowMotion:
+        """The one that fits best with another standard deviation of the prior."""
+        wide, narrow = (self.information + np.diag(self.precision / each**2) for each in (self.sigma, sigma))
+        return _changed(self.prior, np.asarray(np.linalg.solve(narrow, wide @ self.moved), np.float64))
 
 
 def fit_rows(
@@ -50,11 +71,11 @@ def fit_rows(
     ahead = inside[:, 2] > 0
     features, inside = features[ahead], inside[ahead]
     if len(features) < MIN_POINTS:
-        return RowFit(prior, np.zeros(6), np.full(6, np.inf))
+        return RowFit(prior, np.zeros(6), np.zeros((6, 6)), np.ones(6), sigma)
     camera = keyframe.camera
     measured = keyframe.measured[features].astype(np.float64)
     times = prior.row_times(camera.distort_points(measured)[:, 1])[:, None, None]
-    precision = 1.0 / (sigma * np.repeat([1.0, float(np.median(inside[:, 2]))], 3)) ** 2
+    precision = np.repeat([1.0, 1.0 / float(np.median(inside[:, 2])) ** 2], 3)
     moved = np.zeros(6)
     fitted = prior
     for _ in range(MAX_STEPS):
@@ -70,13 +91,18 @@ def fit_rows(
         weighted = (np.repeat(weights, 2)[:, None] * rows).T
         information = weighted @ rows
         normal = information.copy()
-        normal[np.arange(6, 12), np.arange(6, 12)] += precision
+        normal[np.arange(6, 12), np.arange(6, 12)] += precision / sigma**2
         pull = weighted @ error.ravel()
-        pull[6:] -= precision * moved
+        pull[6:] -= precision / sigma**2 * moved
         change = np.linalg.solve(normal, pull)
         inside = inside @ rotation_from_vector(change[None, :3])[0].T + change[3:6]
         moved += change[6:]
-        fitted = replace(prior, angular=prior.angular + moved[:3], linear=prior.linear + moved[3:])
+        fitted = _changed(prior, moved)
         if np.sqrt(2.0 * ((rows @ change) ** 2).mean()) < CONVERGED:
             break
-    return RowFit(fitted, moved, np.sqrt(np.diag(np.linalg.pinv(information))[6:]))
+    of_pose, both, of_velocity = information[:6, :6], information[:6, 6:], information[6:, 6:]
+    return RowFit(prior, moved, of_velocity - both.T @ np.linalg.solve(of_pose, both), precision, sigma)
+
+
+def _changed(motion: RowMotion, by: FloatArray) -> RowMotion:
+    return replace(motion, angular=motion.angular + by[:3], linear=motion.linear + by[3:])

@@ -3,9 +3,9 @@
 
 The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
 are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
-(Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). The ends of the
-trajectory, where a spline is poor, are corrected by what their own rows tell beside points that many views hold. So
-are the few views whose rows contradict it, as where a walk turns a corner, and so is what is predicted of a new view.
+(Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). What the rows of a view
+tell beside points that many views hold corrects its velocity, with that of the spline as a prior: a narrow one within
+a long trajectory, a wide one at the ends, where a spline is poor, and for what is predicted of a new view.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Container, Mapping, MutableMapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,10 +50,21 @@ LONG_TRAJECTORY = 4 * 2 * END_KNOTS
 # to be wrong: with six numbers of each of 100 views, by chance in one trajectory of 25.
 CONTRADICTED = 4.0
 NORMAL_SPREAD = 1.4826  # standard deviations of a normal distribution in its median absolute deviation
+# rad/s and depths of the scene per second, by which the spline's velocities are off where it is not wrong: the 6 %
+# above of a hand that sways by 0.004 rad at 1.7 Hz.
+SPLINE_SIGMA = 0.003
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
 # Views of a point that tells how one of them moves: with fewer, that view has too much say in where the point is, and
 # the point follows the view's own error.
 LONG_TRACK = 6
+
+
+@dataclass(frozen=True)
+class _ByRows:
+    """Motions by stamp: of views where the rows decide, and of those where they are held to the spline."""
+
+    decided: dict[int, RowMotion]
+    held: dict[int, RowMotion]
 
 
 def row_motions(
@@ -62,11 +73,13 @@ def row_motions(
     readout: float,
     near: IntArray | None = None,
     count: int | None = None,
+    rows_correct: bool = True,
 ) -> dict[int, RowMotion]:
     """How the model moves as seen from its views, by stamp; left out where it is unknown.
 
     Lengths are in the unit of the model. Each camera of a rig has a trajectory of its own. With `near`, the trajectory
-    is that of these views alone, and the motions are those of the first `count` of them.
+    is that of these views alone, and the motions are those of the first `count` of them. Without `rows_correct`
+    views that do not contradict the spline have its velocities.
     """
     views = np.arange(len(model)) if near is None else near
     wanted = set(views[:count].tolist())
@@ -89,7 +102,8 @@ def row_motions(
             }
             if motions and readout > 0.0:
                 is_long = near is None and len(part) >= LONG_TRAJECTORY
-                motions |= _by_own_rows(model, part, keyframes, motions, wanted, is_long)
+                fits = _by_own_rows(model, part, keyframes, motions, wanted, is_long)
+                motions |= fits.decided | (fits.held if rows_correct else {})
             found |= motions
     asked = {model.stamps[view] for view in wanted}
     return {stamp: motion for stamp, motion in found.items() if stamp in asked}
@@ -202,11 +216,11 @@ def _by_own_rows(
     motions: Mapping[int, RowMotion],
     wanted: Container[int],
     is_long: bool,
-) -> dict[int, RowMotion]:
-    """Motions of the views, in order of time, that follow their own rows and not the spline's `motions`, by stamp.
+) -> _ByRows:
+    """The spline's `motions` of views, in order of time, as their own rows correct them; those `wanted` alone.
 
-    Those are the outermost ones; in a long trajectory END_KNOTS at each end, and those that contradict the spline.
-    Views that are not `wanted` are left out.
+    The rows decide for the outermost views, in a long trajectory for END_KNOTS at each end and for those that
+    contradict the spline. There, all others are held to it.
     """
     stamps = [model.stamps[view] for view in views]
     gaps = np.diff(stamps, prepend=stamps[0], append=stamps[-1]) * 1e-9
@@ -229,10 +243,11 @@ def _by_own_rows(
             at_ends[stamp] = fit.motion
         else:
             inner[stamp] = fit
-    wrong = _contradicted(list(inner.values()))
-    return at_ends | {
-        stamp: fit.motion for (stamp, fit), is_wrong in zip(inner.items(), wrong, strict=True) if is_wrong
-    }
+    wrong = dict(zip(inner, _contradicted(list(inner.values())), strict=True))
+    return _ByRows(
+        at_ends | {stamp: fit.motion for stamp, fit in inner.items() if wrong[stamp]},
+        {stamp: fit.held_to(SPLINE_SIGMA) for stamp, fit in inner.items() if not wrong[stamp]},
+    )
 
 
 def _contradicted(fits: list[RowFit]) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
 from pipeprog_sfm.features.sift import Features, extract
-from pipeprog_sfm.model.row_motion import predicted_motion, row_motions, told_by_rows, unrolled_by
+from pipeprog_sfm.model.row_motion import predicted_motion, row_motions, told_by_rows, unroll, unrolled_by
 from pipeprog_sfm.model.self_calibration import Priors, Refinement, refine
 from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.localizer import Localizer
@@ -136,10 +137,15 @@ class Mapper:
 
     def self_calibration(self, told: Priors) -> Refinement | None:
         """The camera that the published model agrees with best; None where that is not known, or of several cameras."""
-        model = self.map.published
-        cameras = {self.map.keyframes[stamp].camera for stamp in model.stamps}
-        motions = row_motions(model, self.map.keyframes, self.map.readout) if told.sigmas[3] > 0 else {}
-        return refine(model, self.map.keyframes, told, motions) if len(cameras) == 1 else None
+        model, keyframes, motions = self.map.published, self.map.keyframes, {}
+        if len({keyframes[stamp].camera for stamp in model.stamps}) != 1:
+            return None
+        if told.sigmas[3] > 0:
+            motions = row_motions(model, keyframes, self.map.readout, rows_correct=False)
+        if self.map.readout and motions:
+            model, keyframes = copy.deepcopy(model), dict(keyframes)
+            unroll(model, keyframes, motions)
+        return refine(model, keyframes, told, motions)
 
     def take_camera(self, refinement: Refinement) -> None:
         """Goes on with a refined camera: the published model has its poses, all else is adjusted to it."""

@@ -132,19 +132,21 @@ class SparseMap:
                 link(model, view, self.keyframes)
             self.adjust_globally(model, MAX_TURNS)
 
-    def motions(self, model: SparseModel, readout: float | None = None) -> dict[int, RowMotion]:
+    def spline_motions(self, model: SparseModel, readout: float) -> dict[int, RowMotion]:
+        """As `motions`, by the poses and a read-out [s] alone: velocities that rows correct take up its error, too."""
+        return row_motions(model, self.keyframes, readout, rows_correct=False) if readout else {}
+
+    def motions(self, model: SparseModel) -> dict[int, RowMotion]:
         """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout.
 
-        These are the motions that its features were unrolled with; with a `readout` [s], those by that one.
+        These are the motions that its features were unrolled with.
         """
-        if readout is not None:
-            return row_motions(model, self.keyframes, readout) if readout else {}
         used = {stamp: self.keyframes[stamp].motion for stamp in model.stamps}
         return {stamp: motion for stamp, motion in used.items() if motion is not None}
 
     def _unroll(self, model: SparseModel) -> float:
         """Shifts the features of a model by how it moves now; see `unroll`."""
-        return unroll(model, self.keyframes, self.motions(model, self.readout))
+        return unroll(model, self.keyframes, row_motions(model, self.keyframes, self.readout)) if self.readout else 0.0
 
     def _adjust_rolling(self, model: SparseModel, turns: int) -> None:
         """Finds the shifts of features and the poses in turns, until the shifts stay."""

@@ -18,6 +18,7 @@ from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
+from pipeprog_sfm.model.row_fit import fit_rows
 from pipeprog_sfm.model.row_motion import row_motions, told_by_rows
 from pipeprog_sfm.model.self_calibration import Priors
 from pipeprog_sfm.model.sparse_model import SparseModel
@@ -115,6 +116,23 @@ def test_views_of_a_sudden_turn_follow_their_own_rows() -> None:
         stamp = number * STEP
         np.testing.assert_allclose(motions[stamp].angular, motion_at(stamp * 1e-9, turned).angular, atol=0.05)
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
+
+
+def test_a_fit_is_held_to_a_prior_as_if_it_were_made_with_it(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    mapper = told[0]
+    model, stamp = mapper.map.published, 4 * STEP
+    keyframe = mapper.map.keyframes[stamp]
+    own = model.point_of[model.features(model.stamps.index(stamp))]
+    features = np.flatnonzero(own >= 0)
+    inside = model.points[own[features]] @ model.rotation[4].T + model.translation[4]
+    known = mapper.map.motions(model)[stamp]
+    prior = replace(known, angular=known.angular + np.array([0.0, 0.05, 0.0]))
+    wide, narrow = (fit_rows(inside, keyframe, features, model.noise, prior, sigma) for sigma in (0.2, 0.003))
+    held = wide.held_to(0.003)
+    assert np.linalg.norm(narrow.moved - wide.moved) > 0.01, "a narrow prior decides otherwise"
+    # The robust weights are those of the wide fit.
+    np.testing.assert_allclose(held.angular, narrow.motion.angular, atol=2e-3)
+    np.testing.assert_allclose(held.linear, narrow.motion.linear, atol=2e-3 * np.median(inside[:, 2]))
 
 
 def test_a_sway_between_two_poses_is_told() -> None:
