@@ -20,22 +20,31 @@ from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import PROCESS
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION
 
-_OPTIONAL = {"refined": (CameraInfo, REFINED_CALIBRATION)}
+_OPTIONAL = {
+    "refined": (CameraInfo, REFINED_CALIBRATION),
+    "velocities": (msg.KeyframeVelocities, "keyframe_velocities"),
+}
 _RESULTS = {"cloud": (PointCloud2, "map_points"), "poses": (PathMsg, "keyframe_poses")} | {
     "pipes": (msg.PipeArray, "pipes"),
     "markers": (MarkerArray, "pipe_markers"),
 }
+# Results that carry the stamp of their map.
+_OF_ONE_MAP = {"cloud", "poses", "pipes", "velocities"}
 
 
 @dataclasses.dataclass(frozen=True)
 class LastMessages:
-    """The last messages of the graph, all of one map; `refined` where the survey has refined the calibration."""
+    """The last messages of the graph, all of one map.
+
+    `refined` where the survey has refined the calibration, `velocities` with a rolling shutter.
+    """
 
     cloud: PointCloud2
     poses: PathMsg
     pipes: msg.PipeArray
     markers: MarkerArray
     refined: CameraInfo | None = None
+    velocities: msg.KeyframeVelocities | None = None
 
 
 class Listener:
@@ -66,21 +75,24 @@ class Listener:
 
     def results(self) -> LastMessages:
         """The results that were received; `missing_results` must be empty."""
-        return LastMessages(**self._results)
+        return LastMessages(**{name: self._results[name] for name in self._expected})
 
     def missing_results(self, revision: int) -> str:
         """What lacks until all results are there and of the map `revision`; empty when nothing does."""
-        absent = [topic for name, (_, topic) in _RESULTS.items() if name not in self._results]
+        absent = [topic for name, topic in self._expected.items() if name not in self._results]
         if absent:
             return f"these results have not come: {', '.join(absent)}"
-        pipes = self._results["pipes"]
-        stamps = {name: self._results[name].header.stamp for name in ("cloud", "poses", "pipes")}
-        if self.status.camera_refined and "refined" not in self._results:
-            return f"these results have not come: {REFINED_CALIBRATION}"
-        newest = min(self.status.map_revision, pipes.map_revision) >= revision
-        if newest and all(stamp == stamps["pipes"] for stamp in stamps.values()):
+        stamps = {messages.stamp_ns(self._results[name].header.stamp) for name in _OF_ONE_MAP & self._expected.keys()}
+        newest = min(self.status.map_revision, self._results["pipes"].map_revision) >= revision
+        if newest and len(stamps) == 1:
             return ""
         return "cloud, poses and pipes are not of one map; does another graph run in this ROS domain?"
+
+    @property
+    def _expected(self) -> dict[str, str]:
+        """The topics of the results that belong to the last map, by name."""
+        is_sent = {"refined": self.status.camera_refined, "velocities": self.status.readout > 0.0}
+        return {name: topic for name, (_, topic) in (_RESULTS | _OPTIONAL).items() if is_sent.get(name, True)}
 
     def _on_decision(self, message: msg.FrameDecision) -> None:
         self._watchdog.moved()

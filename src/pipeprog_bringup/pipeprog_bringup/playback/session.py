@@ -91,7 +91,7 @@ class Session:
             revision = self._finish("sfm", keyframes)
         if not revision:
             raise InputError(self._listener.status.message or "nothing was reconstructed: no map came from sfm")
-        self._listener.receive("cloud", "poses", "refined")
+        self._listener.receive("cloud", "poses", "refined", "velocities")
         with self._timed("detect", "detecting pipes"):
             self._finish("detect", revision)
         self._listener.receive("pipes", "markers")

@@ -38,6 +38,7 @@ from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map, write_map
 from pipeprog_sfm.alignment.survey_map import MappedPipe, SurveyMap
 
 _SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}
+_SURVEY_TOPICS |= {"velocities": "keyframe_velocities"}
 
 
 def write_survey(
@@ -120,6 +121,8 @@ def record_survey(recording: BagWriter, survey: LastMessages, status: msg.SfmSta
     stamp = messages.stamp_ns(survey.poses.poses[0].header.stamp)
     recorded = [(topic, getattr(survey, name)) for name, topic in _SURVEY_TOPICS.items()] + [("sfm_status", status)]
     for topic, message in recorded:
+        if message is None:
+            continue
         recording.write(f"/{topic}", type_name(type(message)), serialize_message(message), stamp, latched=True)
 
 

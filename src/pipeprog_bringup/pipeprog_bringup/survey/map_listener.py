@@ -24,7 +24,7 @@ class MapListener:
     """Subscribes to maps and pipes, which belong together where they have one stamp.
 
     Attributes:
-        newest: cloud, poses, pipes and markers of one map; None before the first.
+        newest: cloud, poses, pipes, markers and velocities of one map; None before the first.
         poses: the last poses; None before the first.
     """
 
@@ -33,11 +33,13 @@ class MapListener:
         self.poses: Path | None = None
         self._clouds: OrderedDict[int, PointCloud2] = OrderedDict()
         self._poses: OrderedDict[int, Path] = OrderedDict()
+        self._velocities: OrderedDict[int, msg.KeyframeVelocities] = OrderedDict()
         self._pipes: msg.PipeArray | None = None
         self._markers: MarkerArray | None = None
         self._refined: CameraInfo | None = None
         node.create_subscription(PointCloud2, "map_points", self._on_cloud, qos.latched())
         node.create_subscription(Path, "keyframe_poses", self._on_poses, qos.latched())
+        node.create_subscription(msg.KeyframeVelocities, "keyframe_velocities", self._on_velocities, qos.latched())
         node.create_subscription(msg.PipeArray, "pipes", self._on_pipes, qos.latched())
         node.create_subscription(MarkerArray, "pipe_markers", self._on_markers, qos.latched())
         node.create_subscription(CameraInfo, REFINED_CALIBRATION, self._on_refined, qos.latched())
@@ -54,6 +56,10 @@ class MapListener:
     def _on_poses(self, message: Path) -> None:
         self.poses = message
         _keep(self._poses, message, _POSES)
+        self._join()
+
+    def _on_velocities(self, message: msg.KeyframeVelocities) -> None:
+        _keep(self._velocities, message, _POSES)
         self._join()
 
     def _on_pipes(self, message: msg.PipeArray) -> None:
@@ -76,8 +82,8 @@ class MapListener:
             return
         if stamp in self._clouds and stamp in self._poses:
             parts = self._clouds[stamp], self._poses[stamp], self._pipes, self._markers
-            self.newest = LastMessages(*parts, self._refined)
-            for kept in (self._clouds, self._poses):
+            self.newest = LastMessages(*parts, self._refined, self._velocities.get(stamp))
+            for kept in (self._clouds, self._poses, self._velocities):
                 for old in [each for each in kept if each < stamp]:
                     del kept[old]
 
