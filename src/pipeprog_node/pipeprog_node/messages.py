@@ -159,6 +159,13 @@ def keyframe_velocities(
     return KeyframeVelocities(header=path_header, readout=readout, velocities=velocities)
 
 
+def row_velocities(message: KeyframeVelocities) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """The read-out [s], linear (N, 3) [m/s] and angular (N, 3) [rad/s] velocities, as they came."""
+    parts = [[(v.x, v.y, v.z) for v in (twist.linear, twist.angular)] for twist in message.velocities]
+    linear, angular = np.array(parts, float).reshape(-1, 2, 3).swapaxes(0, 1)
+    return message.readout, linear, angular
+
+
 def poses_from_path(message: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """(N,) stamps [ns] and (N, 4, 4) poses of a path; raises InputError where a pose is no position and rotation."""
     stamps = np.array([stamp_ns(pose.header.stamp) for pose in message.poses], np.int64)

@@ -31,7 +31,7 @@ from pipeprog_detect.product.boq import PlannedPipe
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun
 from pipeprog_detect.product.product import Product
-from pipeprog_detect.types import Cylinder, Pipe, PipeEnd, View
+from pipeprog_detect.types import Cylinder, Pipe, PipeEnd, RowVelocities, View
 from pipeprog_msgs import msg
 from pipeprog_node import messages
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map, write_map
@@ -153,17 +153,22 @@ def record_cameras(recording: BagWriter, survey: LastMessages, infos: Mapping[in
     """
     cameras = {}
     stamps, poses = messages.poses_from_path(survey.poses)
-    places = dict(zip(stamps.tolist(), poses, strict=True))
+    rows = {stamp: row for row, stamp in enumerate(stamps.tolist())}
     pipes = _colored(survey)
+    velocities = None
+    if survey.velocities is not None and len(survey.velocities.velocities) == len(stamps):
+        velocities = RowVelocities(*messages.row_velocities(survey.velocities))
     refined = None if survey.refined is None else messages.camera_from_info(survey.refined)
     for stamp, sent in infos.items():
         used = messages.info_from_camera(refined, stamp, sent.header.frame_id) if refined else sent
         cameras[stamp] = messages.camera_from_info(used)
         recording.write("/keyframes/camera_info", cdr.CAMERA_INFO, serialize_message(used), stamp)
-        if stamp in places:
-            moved = TFMessage(transforms=[messages.transform(stamp, "map", sent.header.frame_id, places[stamp])])
+        if stamp in rows:
+            pose = poses[rows[stamp]]
+            moved = TFMessage(transforms=[messages.transform(stamp, "map", sent.header.frame_id, pose)])
             recording.write("/tf", cdr.TF, serialize_message(moved), stamp)
-            outlines = outline_marker(stamp, sent.header.frame_id, cameras[stamp], places[stamp], pipes)
+            rolled = velocities.rolled(rows[stamp], cameras[stamp]) if velocities else None
+            outlines = outline_marker(stamp, sent.header.frame_id, cameras[stamp], pose, pipes, rolled)
             recording.write("/keyframes/outlines", type_name(ImageMarker), serialize_message(outlines), stamp)
     return cameras
 

@@ -136,6 +136,10 @@ class Bag:
         """Stream the images; each carries the CameraInfo last recorded for its frame (the first one, before any)."""
         return (message for message in self._stream(set()) if isinstance(message, ImageMessage))
 
+    def messages(self, topic: str) -> Iterator[bytes]:
+        """The messages of another topic of the recording, in CDR."""
+        return (message.data for message in messages_of(self._files, {topic}))
+
     def with_motion(self) -> Iterator[ImageMessage | MotionMessage]:
         """Stream the images, and the messages of odometry, TF and IMU between them; static transforms come first."""
         for topic in sorted(self.motion_topics):

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from pipeprog_bringup.recording.definitions import message_definition
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera, check_whole_sensor
-from pipeprog_camera.limits import MAX_DISTORTION_COEFFICIENTS, MAX_NAME, MAX_SECONDS, MAX_SMALL_MESSAGE
+from pipeprog_camera.limits import MAX_DISTORTION_COEFFICIENTS, MAX_NAME, MAX_POSES, MAX_SECONDS, MAX_SMALL_MESSAGE
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -145,6 +145,20 @@ def read_camera_info(data: bytes) -> CameraInfo:
     reader.number("B")  # do_rectify
     binning, offset, region = (binning_x, binning_y), (x, y), (region_width, region_height)
     return CameraInfo(frame_id, width, height, model, distortion, k, binning, offset, region)
+
+
+def read_velocities(data: bytes) -> tuple[float, FloatArray]:
+    """The read-out [s] and the (N, 2, 3) velocities, linear and angular, of a pipeprog_msgs/KeyframeVelocities.
+
+    ValueError where they are damaged.
+    """
+    reader = _Reader(data)
+    reader.header()
+    readout = reader.numbers("d", 1)[0]
+    count = reader.number("I")
+    if count > MAX_POSES:
+        raise ValueError(f"{count} velocities")
+    return readout, np.array(reader.numbers("d", 6 * count)).reshape(count, 2, 3)
 
 
 def read_image(data: bytes, type_name: str) -> ImageFields:

@@ -19,7 +19,8 @@ from pipeprog_bringup.results.results_reader import Results
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.types import Cylinder
+from pipeprog_camera.rolled_image import RolledImage
+from pipeprog_detect.types import Cylinder, RowVelocities
 
 SAMPLES = 25  # positions along an axis at which it is asked whether a keyframe shows it
 CELL = 16  # px of a keyframe, the side of a cell of the depth map of what hides a pipe
@@ -80,9 +81,22 @@ def photographs(
         if not rows:
             return none, f"{path} holds no keyframe of trajectory.tum"
         chosen = [best_views(*pipe) for pipe in _each_pipe(sight(views, results.cylinders, points))]
-        return _cropped(bag, results, rows, views, chosen, colors), ""
+        velocities = _velocities(bag, len(results.stamps))
+        cameras_of = [(row, camera) for row, (camera, _) in zip(rows, views, strict=True)]
+        rolled = [velocities.rolled(*each) if velocities else None for each in cameras_of]
+        return _cropped(bag, results, rows, views, rolled, chosen, colors), ""
     except (InputError, ValueError) as error:
         return none, str(error)
+
+
+def _velocities(bag: Bag, count: int) -> RowVelocities | None:
+    """How the map moves as seen from the `count` keyframes of a rolling shutter, None for another camera."""
+    found = None
+    for data in bag.messages("/keyframe_velocities"):
+        readout, velocities = cdr.read_velocities(data)
+        if len(velocities) == count:
+            found = RowVelocities(readout, velocities[:, 0], velocities[:, 1])
+    return found
 
 
 def sight(views: Sequence[tuple[Camera, FloatArray]], cylinders: Sequence[Cylinder], points: FloatArray) -> Sight:
@@ -156,6 +170,7 @@ def _cropped(
     results: Results,
     rows: Sequence[int],
     views: Sequence[tuple[Camera, FloatArray]],
+    rolled: Sequence[RolledImage | None],
     chosen: Sequence[list[int]],
     colors: Sequence[tuple[float, float, float]],
 ) -> list[list[Photograph]]:
@@ -174,9 +189,8 @@ def _cropped(
         if image is None:
             continue
         for view, pipe in wanted.pop(frame.stamp):
-            photograph = _crop(
-                image.astype(np.uint8), *views[view], results.cylinders[pipe], colors[pipe], side, rows[view] + 1
-            )
+            cylinder, number = results.cylinders[pipe], rows[view] + 1
+            photograph = _crop(image.astype(np.uint8), *views[view], rolled[view], cylinder, colors[pipe], side, number)
             if photograph is not None:
                 found[view, pipe] = photograph
     return [[found[view, pipe] for view in numbers if (view, pipe) in found] for pipe, numbers in enumerate(chosen)]
@@ -192,6 +206,7 @@ def _crop(
     image: NDArray[np.uint8],
     camera: Camera,
     pose: FloatArray,
+    rolled: RolledImage | None,
     cylinder: Cylinder,
     color: tuple[float, float, float],
     side: int,
@@ -204,7 +219,7 @@ def _crop(
     edge = outline(cylinder, pose[:3, 3])
     if not len(edge):
         return None
-    pixels, depth = project(camera, pose, edge)
+    pixels, depth = project(camera, pose, edge, rolled)
     shown = inside(camera, pixels) & (depth > NEAR)
     if not shown.any():
         return None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_detect.types import Cylinder
 
 NEAR = 0.05  # m; nearer to the camera nothing is projected
@@ -31,8 +32,17 @@ def outline(cylinder: Cylinder, centre: FloatArray) -> FloatArray:
     return np.concatenate([line + sides[0], line[::-1] + sides[1]])
 
 
-def project(camera: Camera, pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) of the image as it was taken, and depths (N,) [m], of points (N, 3) of the map."""
+def project(
+    camera: Camera, pose: FloatArray, points: FloatArray, rolled: RolledImage | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) of the image as it was taken, and depths (N,) [m], of points (N, 3) of the map.
+
+    Args:
+        camera: its calibration.
+        pose: (4, 4) map_from_camera.
+        points: of the map [m].
+        rolled: with a rolling shutter, where the image shows what the pose at the stamp would.
+    """
     in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
     depth = in_camera[:, 2]
     rays = in_camera[:, :2] / np.maximum(depth, NEAR)[:, None]
@@ -41,7 +51,10 @@ def project(camera: Camera, pose: FloatArray, points: FloatArray) -> tuple[Float
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     reach = 1.2 * np.abs((camera.undistort_points(corners) - centre) / focal).max(axis=0)
     beyond = (depth < NEAR) | (np.abs(rays) > reach).any(axis=1)
-    pixels = camera.distort_points(np.clip(rays, -reach, reach) * focal + centre)
+    pixels = np.clip(rays, -reach, reach) * focal + centre
+    if rolled is not None:
+        pixels = rolled.shown(pixels, np.maximum(depth, NEAR))
+    pixels = camera.distort_points(pixels)
     pixels[beyond] = np.clip(rays[beyond], -10.0, 10.0) * focal + centre
     pixels[beyond & inside(camera, pixels)] = -1.0
     return pixels, depth

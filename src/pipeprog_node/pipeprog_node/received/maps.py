@@ -144,15 +144,14 @@ def keyframe_velocities(message: KeyframeVelocities) -> ReceivedVelocities:
         raise InvalidMessageError("read-out", "velocities with a read-out of 0 s: a global shutter needs none")
     if len(message.velocities) > MAX_POSES:
         raise InvalidMessageError("velocities", f"{len(message.velocities)} velocities: {MAX_POSES} at most are taken")
-    parts = [[(v.x, v.y, v.z) for v in (twist.linear, twist.angular)] for twist in message.velocities]
-    linear, angular = np.array(parts, float).reshape(-1, 2, 3).swapaxes(0, 1)
+    readout, linear, angular = messages.row_velocities(message)
     for name, values in (("linear", linear), ("angular", angular)):
         wrong = np.flatnonzero(~(np.abs(values) <= MAX_VELOCITY).all(axis=1))  # NaN, too
         if len(wrong):
             raise InvalidMessageError(
                 "velocities", f"the {name} velocity of keyframe {wrong[0]} is {values[wrong[0]]}: no camera moves so"
             )
-    return ReceivedVelocities(stamp, message.readout, linear, angular)
+    return ReceivedVelocities(stamp, readout, linear, angular)
 
 
 def sfm_status(message: SfmStatus) -> ReceivedStatus:

@@ -11,6 +11,7 @@ import pytest
 
 from pipeprog_bringup.report.photographs import best_views, outline, photographs, sight
 from pipeprog_bringup.results.results_reader import read_results
+from pipeprog_camera.rolling_shutter import RowMotion
 from tests.unit.bringup.report.filmed import CAMERA, PAINT, UPRIGHT, looking_along_y, run
 
 END = 8  # px; an end is a circle of 12 px that is seen at up to 17 degrees, and the line has 4 px
@@ -35,6 +36,20 @@ def test_a_photograph_shows_its_pipe_upright_and_outlined(tmp_path: Path, roll: 
             assert abs(painted_at.min() - drawn_at.min()) <= END
             assert abs(painted_at.max() - drawn_at.max()) <= END
         assert (first.keyframe, first.share) == (1, 1.0)
+
+
+def test_outlines_follow_the_rows_of_a_rolling_shutter(tmp_path: Path) -> None:
+    """Read out in 0.1 s at 3 m/s, an upright pipe leans by 40 px, and its outline with it."""
+    motion = RowMotion(0.1, CAMERA.height, np.array([3.0, 0.0, 0.0]), np.zeros(3))
+    results = read_results(run(tmp_path, [looking_along_y(0.0)], motion))
+    proof = photographs(results, np.empty((0, 3)), [(1.0, 1.0, 0.0)] * 2)[0][0][0]
+    image = np.asarray(cv2.imdecode(np.frombuffer(proof.jpeg, np.uint8), cv2.IMREAD_COLOR)).astype(int)
+    painted = np.abs(image - PAINT[0]).max(axis=2) < 60
+    outlined = (image[..., 0] < 120) & (image[..., 1] > 170) & (image[..., 2] > 170)
+    rows = np.flatnonzero(painted.any(axis=1))[10:-10]
+    middles = np.array([[np.flatnonzero(part[row]).mean() for part in (painted, outlined)] for row in rows])
+    assert np.ptp(middles[:, 0]) > 25
+    np.testing.assert_allclose(middles[:, 1], middles[:, 0], atol=3)
 
 
 def test_the_whole_pipe_comes_before_a_part_and_what_hides_it_counts() -> None:
