@@ -20,7 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
+from geometry_msgs.msg import Accel, PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import Odometry, Path
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
@@ -123,7 +123,7 @@ def good_messages(number: int) -> dict[str, Any]:
         "/tf_static": TFMessage(transforms=[edge]),
         "map_points": messages.point_cloud(map_header, points, np.zeros((500, 3), np.uint8), normals),
         "keyframe_poses": messages.path(map_header, stamp + np.arange(3) * STEP, poses),
-        "keyframe_velocities": messages.keyframe_velocities(map_header, 0.015, np.ones((3, 3)), np.zeros((3, 3))),
+        "keyframe_velocities": messages.keyframe_velocities(map_header, 0.015, *np.ones((4, 3, 3))),
         "keyframes/refined_camera_info": info,
         "sfm_status": msg.SfmStatus(header=map_header, map_revision=number + 1, map_stamp=header.stamp, metric=True),
     }
@@ -387,6 +387,7 @@ def _many_retired(message: msg.KeyframesRetired, rng: random.Random) -> None:
 
 def _many_velocities(message: msg.KeyframeVelocities, rng: random.Random) -> None:
     message.velocities = (message.velocities or [Twist()])[:1] * rng.choice(MANY)
+    message.accelerations = rng.choice(([], [Accel()] * 2, [Accel()] * len(message.velocities)))
     message.readout = rng.choice((0.0, -1.0, 1e9, math.nan, math.inf))
 
 

@@ -20,6 +20,7 @@ MAX_OFF_CENTRE = 1.0  # image sizes from the border to a principal point outside
 MAX_CORNER_SHIFT = 1.0  # diagonals by which distortion moves a corner; the strongest barrel lenses stay below 0.5
 MAX_DISTORTION_COEFFICIENTS = 14  # of rational_polynomial, the longest model
 MAX_READOUT = 0.1  # s from the first row to the last; phones take 0.004 to 0.035, the slowest drones 0.074
+MAX_ACCELERATION = 1e5  # m/s^2 and rad/s^2 of a camera, a hundred times what a fall on concrete makes
 MAX_VELOCITY = 1000.0  # m/s and rad/s of a camera; a drone flies at 20 and turns at 5
 
 # Clouds and trajectories.

@@ -39,10 +39,15 @@ class RolledImage:
 
     @cached_property
     def numbers(self) -> FloatArray:
-        """fx, fy, cx, cy, s per row, s of row 0 after the stamp, linear (3) and angular (3) velocity; for kernels."""
+        """fx, fy, cx, cy, s per row, s of row 0 after the stamp, rates (4 x 3); for kernels.
+
+        Rates are linear and angular velocity, and half of the linear and of the angular acceleration.
+        """
         first, second = self.motion.row_times([0.0, 1.0])
         lens = [self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy]
-        return np.array([*lens, second - first, first, *self.motion.linear, *self.motion.angular])
+        motion = self.motion
+        halves = 0.5 * motion.linear_acceleration, 0.5 * motion.angular_acceleration
+        return np.concatenate([lens, [second - first, first], motion.linear, motion.angular, *halves])
 
     @property
     def rows(self) -> FloatArray:
@@ -115,14 +120,16 @@ def shown_at(u: float, v: float, depth: float, numbers: FloatArray, rows: FloatA
     for _ in range(_MOST_STEPS):
         left, above = column, line
         time = first + per_row * row_of(column, line, numbers, rows)
-        a, b, c = time * numbers[9], time * numbers[10], time * numbers[11]
+        a = time * (numbers[9] + time * numbers[15])
+        b = time * (numbers[10] + time * numbers[16])
+        c = time * (numbers[11] + time * numbers[17])
         # Rodrigues' formula; the series of sine and cosine are exact to 1e-7 up to 0.2 rad within one read-out.
         square = a * a + b * b + c * c
         sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
         p, q, r = b * depth - c * y, c * x - a * depth, a * y - b * x
-        far = depth + sine * r + cosine * (a * q - b * p) + time * numbers[8]
-        column = fx * (x + sine * p + cosine * (b * r - c * q) + time * numbers[6]) / far + cx
-        line = fy * (y + sine * q + cosine * (c * p - a * r) + time * numbers[7]) / far + cy
+        far = depth + sine * r + cosine * (a * q - b * p) + time * (numbers[8] + time * numbers[14])
+        column = fx * (x + sine * p + cosine * (b * r - c * q) + time * (numbers[6] + time * numbers[12])) / far + cx
+        line = fy * (y + sine * q + cosine * (c * p - a * r) + time * (numbers[7] + time * numbers[13])) / far + cy
         if abs(column - left) + abs(line - above) < _SETTLED:
             break
     return column, line

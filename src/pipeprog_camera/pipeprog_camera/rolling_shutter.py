@@ -8,7 +8,7 @@ back.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,19 +23,24 @@ from pipeprog_camera.limits import MAX_READOUT
 class RowMotion:
     """How the scene moves, seen from the camera, while one image is read out.
 
-    A point that is at P at the stamp is at exp([angular]x t) P + linear t in the camera's frame, t later.
+    A point that is at P at the stamp is at exp([angular]x t) P + linear t in the camera's frame, t later; with their
+    accelerations, each velocity stands for its mean over t, which differs by half of the acceleration times t.
 
     Attributes:
         readout: from the first row to the last, s; 0: all rows at once.
         height: rows of the image.
         linear: (3,) float64, m/s, or model units per second.
         angular: (3,) float64, rad/s.
+        linear_acceleration: (3,) float64, m/s^2.
+        angular_acceleration: (3,) float64, rad/s^2.
     """
 
     readout: float
     height: int
     linear: FloatArray
     angular: FloatArray
+    linear_acceleration: FloatArray = field(default_factory=lambda: np.zeros(3))
+    angular_acceleration: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         check_readout(self.readout)
@@ -58,11 +63,11 @@ class RowMotion:
         measured = np.asarray(pixels, float).reshape(-1, 2)
         if self.readout == 0.0:
             return measured
-        times = self.row_times(camera.distort_points(measured)[:, 1])
+        times = self.row_times(camera.distort_points(measured)[:, 1])[:, None]
         rays = np.c_[(measured - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(measured))]
-        back = -self.angular * times[:, None]
+        back = -(self.angular + 0.5 * self.angular_acceleration * times) * times
         rays = _turned(back, rays)
-        shifts = _turned(back, self.linear * times[:, None])
+        shifts = _turned(back, (self.linear + 0.5 * self.linear_acceleration * times) * times)
         # The point lies on the ray of its own moment; the length on it follows from its depth at the stamp.
         lengths = (np.asarray(depths, float) + shifts[:, 2]) / rays[:, 2]
         return _projected(lengths[:, None] * rays - shifts, camera)

@@ -156,9 +156,14 @@ def _map_command(whole: CompleteMap, final: bool) -> Map:
         poses.map_from_camera,
         final,
         None if camera is None else camera.camera,
-        None if velocities is None else RowVelocities(velocities.readout, velocities.linear, velocities.angular),
+        None if velocities is None else _row_velocities(velocities),
         BoardCircles.of(status.circles),
     )
+
+
+def _row_velocities(received: ReceivedVelocities) -> RowVelocities:
+    velocities = received.linear, received.angular
+    return RowVelocities(received.readout, *velocities, received.linear_acceleration, received.angular_acceleration)
 
 
 class PipeOutput:

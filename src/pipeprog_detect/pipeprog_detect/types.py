@@ -67,15 +67,20 @@ class RowVelocities:
         readout: from the first row to the last [s].
         linear: (M, 3) [m/s].
         angular: (M, 3) [rad/s].
+        linear_acceleration: (M, 3) [m/s^2].
+        angular_acceleration: (M, 3) [rad/s^2].
     """
 
     readout: float
     linear: FloatArray
     angular: FloatArray
+    linear_acceleration: FloatArray
+    angular_acceleration: FloatArray
 
     def rolled(self, index: int, camera: Camera) -> RolledImage:
         """Where the keyframe of that number, of that calibration, shows what its pose at the stamp would."""
-        motion = RowMotion(self.readout, camera.height, self.linear[index], self.angular[index])
+        rates = self.linear, self.angular, self.linear_acceleration, self.angular_acceleration
+        motion = RowMotion(self.readout, camera.height, *(rate[index] for rate in rates))
         return RolledImage(motion, camera)
 
 

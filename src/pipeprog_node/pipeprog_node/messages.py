@@ -8,7 +8,7 @@ from array import array
 import cv2
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform, TransformStamped, Twist, Vector3
+from geometry_msgs.msg import Accel, Point, Pose, PoseStamped, Quaternion, Transform, TransformStamped, Twist, Vector3
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -148,22 +148,28 @@ def transform(stamp: int, parent: str, child: str, parent_from_child: NDArray[np
     return TransformStamped(header=header(stamp, parent), child_frame_id=child, transform=moved)
 
 
-def keyframe_velocities(
-    path_header: Header, readout: float, linear: NDArray[np.float64], angular: NDArray[np.float64]
-) -> KeyframeVelocities:
-    """Velocities (N, 3) [m/s] and (N, 3) [rad/s] for the path of equal header; readout in s."""
-    velocities = []
-    for shift, turn in zip(linear.tolist(), angular.tolist(), strict=True):
-        (x, y, z), (rx, ry, rz) = shift, turn
-        velocities.append(Twist(linear=Vector3(x=x, y=y, z=z), angular=Vector3(x=rx, y=ry, z=rz)))
-    return KeyframeVelocities(header=path_header, readout=readout, velocities=velocities)
+def keyframe_velocities(path_header: Header, readout: float, *rates: NDArray[np.float64]) -> KeyframeVelocities:
+    """Rates for the path of equal header, all (N, 3): velocities, linear [m/s] and angular [rad/s], and accelerations.
+
+    readout in s.
+    """
+    vectors = [[Vector3(x=x, y=y, z=z) for x, y, z in rate.tolist()] for rate in rates]
+    velocities, accelerations = zip(*vectors[:2], strict=True), zip(*vectors[2:], strict=True)
+    return KeyframeVelocities(
+        header=path_header,
+        readout=readout,
+        velocities=[Twist(linear=linear, angular=angular) for linear, angular in velocities],
+        accelerations=[Accel(linear=linear, angular=angular) for linear, angular in accelerations],
+    )
 
 
-def row_velocities(message: KeyframeVelocities) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """The read-out [s], linear (N, 3) [m/s] and angular (N, 3) [rad/s] velocities, as they came."""
-    parts = [[(v.x, v.y, v.z) for v in (twist.linear, twist.angular)] for twist in message.velocities]
-    linear, angular = np.array(parts, float).reshape(-1, 2, 3).swapaxes(0, 1)
-    return message.readout, linear, angular
+def row_rates(message: KeyframeVelocities) -> tuple[NDArray[np.float64], ...]:
+    """Linear and angular velocities (N, 3) and accelerations (N, 3), zero where none came, as they are sent."""
+    found: list[NDArray[np.float64]] = []
+    for part in (message.velocities, message.accelerations or [Accel()] * len(message.velocities)):
+        vectors = [[(v.x, v.y, v.z) for v in (each.linear, each.angular)] for each in part]
+        found += list(np.array(vectors, float).reshape(-1, 2, 3).swapaxes(0, 1))
+    return tuple(found)
 
 
 def poses_from_path(message: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

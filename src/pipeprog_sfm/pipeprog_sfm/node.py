@@ -215,7 +215,8 @@ class MapOutput:
                     msg.KeyframeVelocities, "keyframe_velocities", qos.latched()
                 )
             each = trajectory.velocities
-            self._velocities.publish(messages.keyframe_velocities(header, each.readout, each.linear, each.angular))
+            rates = each.linear, each.angular, each.linear_acceleration, each.angular_acceleration
+            self._velocities.publish(messages.keyframe_velocities(header, each.readout, *rates))
         self._poses.publish(messages.path(header, trajectory.stamps, trajectory.map_from_camera))
         return header
 

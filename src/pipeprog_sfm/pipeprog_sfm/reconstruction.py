@@ -69,11 +69,15 @@ class Velocities:
         readout: s.
         linear: (M, 3) m/s.
         angular: (M, 3) rad/s.
+        linear_acceleration: (M, 3) m/s^2.
+        angular_acceleration: (M, 3) rad/s^2.
     """
 
     readout: float
     linear: FloatArray
     angular: FloatArray
+    linear_acceleration: FloatArray
+    angular_acceleration: FloatArray
 
 
 @dataclass(frozen=True)
@@ -370,11 +374,12 @@ class Reconstruction:
             return None
         motions = self._map.motions(self._map.published)
         known = np.array([stamp in motions for stamp in stamps.tolist()])
-        velocities = np.zeros((2, len(stamps), 3))
+        rates = np.zeros((4, len(stamps), 3))
         for row in np.flatnonzero(known):
             motion = motions[int(stamps[row])]
-            velocities[:, row] = scale * motion.linear, motion.angular
-        return Velocities(self._map.readout, *velocities)
+            rates[:2, row] = scale * motion.linear, motion.angular
+            rates[2:, row] = scale * motion.linear_acceleration, motion.angular_acceleration
+        return Velocities(self._map.readout, *rates)
 
     def _align(self, reference: SurveyMap) -> None:
         """Puts the model that is published into the frame of the reference, or notes why not."""

@@ -143,7 +143,7 @@ class Stage:
 
     def send_velocities(self, stamp: int, readout: float, linear: FloatArray) -> None:
         header = messages.header(stamp, "map")
-        self._velocities.publish(messages.keyframe_velocities(header, readout, linear, np.zeros_like(linear)))
+        self._velocities.publish(messages.keyframe_velocities(header, readout, linear, *np.zeros((3, *linear.shape))))
 
     def values(self) -> dict[str, str]:
         """What the next diagnostics say, by key; the message under an empty one."""

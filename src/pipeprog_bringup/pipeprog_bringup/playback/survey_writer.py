@@ -156,8 +156,10 @@ def record_cameras(recording: BagWriter, survey: LastMessages, infos: Mapping[in
     rows = {stamp: row for row, stamp in enumerate(stamps.tolist())}
     pipes = _colored(survey)
     velocities = None
-    if survey.velocities is not None and len(survey.velocities.velocities) == len(stamps):
-        velocities = RowVelocities(*messages.row_velocities(survey.velocities))
+    if survey.velocities is not None:
+        rates = messages.row_rates(survey.velocities)
+        if all(len(rate) == len(stamps) for rate in rates):
+            velocities = RowVelocities(survey.velocities.readout, *rates)
     refined = None if survey.refined is None else messages.camera_from_info(survey.refined)
     for stamp, sent in infos.items():
         used = messages.info_from_camera(refined, stamp, sent.header.frame_id) if refined else sent

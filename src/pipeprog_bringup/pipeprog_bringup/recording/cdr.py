@@ -147,18 +147,21 @@ def read_camera_info(data: bytes) -> CameraInfo:
     return CameraInfo(frame_id, width, height, model, distortion, k, binning, offset, region)
 
 
-def read_velocities(data: bytes) -> tuple[float, FloatArray]:
-    """The read-out [s] and the (N, 2, 3) velocities, linear and angular, of a pipeprog_msgs/KeyframeVelocities.
+def read_velocities(data: bytes) -> tuple[float, list[FloatArray]]:
+    """The read-out [s] of a pipeprog_msgs/KeyframeVelocities, and velocities and accelerations, linear and angular.
 
     ValueError where they are damaged.
     """
     reader = _Reader(data)
     reader.header()
     readout = reader.numbers("d", 1)[0]
-    count = reader.number("I")
-    if count > MAX_POSES:
-        raise ValueError(f"{count} velocities")
-    return readout, np.array(reader.numbers("d", 6 * count)).reshape(count, 2, 3)
+    found: list[FloatArray] = []
+    for name in ("velocities", "accelerations"):
+        count = reader.number("I")
+        if count > MAX_POSES:
+            raise ValueError(f"{count} {name}")
+        found += list(np.array(reader.numbers("d", 6 * count)).reshape(count, 2, 3).swapaxes(0, 1))
+    return readout, found
 
 
 def read_image(data: bytes, type_name: str) -> ImageFields:

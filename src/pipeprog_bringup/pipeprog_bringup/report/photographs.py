@@ -93,9 +93,9 @@ def _velocities(bag: Bag, count: int) -> RowVelocities | None:
     """How the map moves as seen from the `count` keyframes of a rolling shutter, None for another camera."""
     found = None
     for data in bag.messages("/keyframe_velocities"):
-        readout, velocities = cdr.read_velocities(data)
-        if len(velocities) == count:
-            found = RowVelocities(readout, velocities[:, 0], velocities[:, 1])
+        readout, rates = cdr.read_velocities(data)
+        if all(len(rate) == count for rate in rates):
+            found = RowVelocities(readout, *rates)
     return found
 
 

@@ -118,8 +118,12 @@ def _same_rows(one: RolledImage, other: RolledImage | None) -> bool:
     if other is None or one.motion.readout != other.motion.readout:
         return False
     farthest = 0.5 * one.motion.readout
-    turn = farthest * float(np.linalg.norm(one.motion.angular - other.motion.angular))
-    return turn < _TURNED and farthest * float(np.linalg.norm(one.motion.linear - other.motion.linear)) < _SHIFTED
+    shift, turn, bend, twist = np.subtract(one.numbers[6:], other.numbers[6:]).reshape(4, 3)
+    turns, shifts = (
+        max(farthest * float(np.linalg.norm(rate + time * half)) for time in (-farthest, farthest))
+        for rate, half in ((turn, twist), (shift, bend))
+    )
+    return turns < _TURNED and shifts < _SHIFTED
 
 
 def _unchanged(one: Cylinder, other: Cylinder) -> bool:

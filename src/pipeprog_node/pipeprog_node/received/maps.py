@@ -12,6 +12,7 @@ from sensor_msgs.msg import PointCloud2
 
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import (
+    MAX_ACCELERATION,
     MAX_CIRCLES,
     MAX_COORDINATE,
     MAX_NAME,
@@ -46,12 +47,14 @@ class ReceivedPoses:
 
 @dataclass(frozen=True)
 class ReceivedVelocities:
-    """Velocities of keyframes: stamp [ns] of the publication, read-out [s], (N, 3) [m/s], (N, 3) [rad/s]."""
+    """How keyframes move: stamp [ns] of the publication, read-out [s], (N, 3) [m/s], [rad/s], [m/s^2], [rad/s^2]."""
 
     stamp: int
     readout: float
     linear: NDArray[np.float64]
     angular: NDArray[np.float64]
+    linear_acceleration: NDArray[np.float64]
+    angular_acceleration: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -137,21 +140,27 @@ def keyframe_poses(message: Path) -> ReceivedPoses:
 
 
 def keyframe_velocities(message: KeyframeVelocities) -> ReceivedVelocities:
-    """Finite velocities within MAX_VELOCITY, and a read-out that a rolling shutter can have."""
+    """Finite rates within MAX_VELOCITY and MAX_ACCELERATION, and a read-out that a rolling shutter can have."""
     stamp, _ = stamp_and_frame(message.header)
     checked_readout(message.readout)
     if message.readout == 0.0:
         raise InvalidMessageError("read-out", "velocities with a read-out of 0 s: a global shutter needs none")
     if len(message.velocities) > MAX_POSES:
         raise InvalidMessageError("velocities", f"{len(message.velocities)} velocities: {MAX_POSES} at most are taken")
-    readout, linear, angular = messages.row_velocities(message)
-    for name, values in (("linear", linear), ("angular", angular)):
-        wrong = np.flatnonzero(~(np.abs(values) <= MAX_VELOCITY).all(axis=1))  # NaN, too
+    if len(message.accelerations) not in (0, len(message.velocities)):
+        count = f"{len(message.accelerations)} accelerations for {len(message.velocities)} velocities"
+        raise InvalidMessageError("accelerations", f"{count}: each keyframe has both")
+    rates = messages.row_rates(message)
+    kinds = [(name, kind) for kind in ("velocity", "acceleration") for name in ("linear", "angular")]
+    for (name, kind), values in zip(kinds, rates, strict=True):
+        most = MAX_VELOCITY if kind == "velocity" else MAX_ACCELERATION
+        wrong = np.flatnonzero(~(np.abs(values) <= most).all(axis=1))  # NaN, too
         if len(wrong):
             raise InvalidMessageError(
-                "velocities", f"the {name} velocity of keyframe {wrong[0]} is {values[wrong[0]]}: no camera moves so"
+                "velocities" if kind == "velocity" else "accelerations",
+                f"the {name} {kind} of keyframe {wrong[0]} is {values[wrong[0]]}: no camera moves so",
             )
-    return ReceivedVelocities(stamp, readout, linear, angular)
+    return ReceivedVelocities(stamp, message.readout, *rates)
 
 
 def sfm_status(message: SfmStatus) -> ReceivedStatus:

@@ -7,6 +7,7 @@ pose at the time t of the pixel's row, and the neighbour has turned and moved on
     (I + s A + s^2 B) (H(t) x + i e(t)) + i s a,    H(t) = H + t H1 + t^2 H2,    e(t) = e + t e1 + t^2 e2.
 
 The series of the rotation ends at the square: the cube is below 0.001 px at 1 rad/s and a read-out of 30 ms.
+Accelerations are left out: 3 m/s^2 move a point by 0.15 mm in 10 ms, less than depth is known to.
 The neighbour's time follows from where the point is seen, which follows from the time: one fixed-point step from the
 row at the stamp leaves the square of the pixels that the image moves while one row is read, 0.1 px at worst.
 """
@@ -167,7 +168,8 @@ def depth_at_the_stamp(
     """
     known = depth[np.isfinite(depth)]
     typical = float(np.median(known)) if len(known) else 1.0
-    coarser = np.array([1.0 / stride] * 4 + [stride] + [1.0] * 7)  # of focal lengths and centre, of s per row
+    # Of focal lengths and centre, of s per row; without accelerations, as in the mapping.
+    coarser = np.array([1.0 / stride] * 4 + [stride] + [1.0] * 7 + [0.0] * 6)
     return _at_the_stamp(depth, typical, image.numbers * coarser, image.rows / stride)
 
 

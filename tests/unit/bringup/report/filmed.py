@@ -68,7 +68,7 @@ def run(folder: Path, poses: list[FloatArray], motion: RowMotion = STILL) -> Pat
             image = cdr.write_compressed_image(stamp, "camera", "jpeg", painted(pose, motion))
             bag.write("/k/image/compressed", cdr.COMPRESSED_IMAGE, image, stamp)
         if motion.readout:
-            of_each = [np.tile(each, (len(poses), 1)) for each in (motion.linear, motion.angular)]
+            of_each = [np.tile(each, (len(poses), 1)) for each in (motion.linear, *np.zeros((3, 3)))]
             velocities = messages.keyframe_velocities(messages.header(stamps[-1], "map"), motion.readout, *of_each)
             data = serialize_message(velocities)
             bag.write("/keyframe_velocities", "pipeprog_msgs/msg/KeyframeVelocities", data, START, latched=True)

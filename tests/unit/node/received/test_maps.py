@@ -68,10 +68,18 @@ def png_of(width: int, height: int) -> bytes:
     return file.getvalue()[:16] + width.to_bytes(4, "big") + height.to_bytes(4, "big") + file.getvalue()[24:]
 
 
-def velocities(speed: float = 1.0, readout: float = 0.015) -> KeyframeVelocities:
+def velocities(speed: float = 1.0, readout: float = 0.015, acceleration: float = 0.0) -> KeyframeVelocities:
     """Of two keyframes."""
     linear = np.array([[0.1, 0.2, 0.3], [0.1, speed, 0.3]])
-    return messages.keyframe_velocities(messages.header(STAMP, "map"), readout, linear, 0.1 * linear)
+    rates = linear, 0.1 * linear, np.zeros((2, 3)), np.full((2, 3), acceleration)
+    return messages.keyframe_velocities(messages.header(STAMP, "map"), readout, *rates)
+
+
+def one_acceleration() -> KeyframeVelocities:
+    """Velocities of two keyframes, and the acceleration of one."""
+    message = velocities()
+    message.accelerations = list(message.accelerations)[:1]
+    return message
 
 
 ROWS: list[tuple[str, Callable[[Any], object], Any]] = [
@@ -102,6 +110,9 @@ ROWS: list[tuple[str, Callable[[Any], object], Any]] = [
     ("poses: position of NaN", received_maps.keyframe_poses, changed(poses(), "poses.1.pose.position.y", np.nan)),
     ("velocities: of NaN", received_maps.keyframe_velocities, velocities(speed=np.nan)),
     ("velocities: faster than any camera", received_maps.keyframe_velocities, velocities(speed=1e9)),
+    ("accelerations: of NaN", received_maps.keyframe_velocities, velocities(acceleration=np.nan)),
+    ("accelerations: larger than any", received_maps.keyframe_velocities, velocities(acceleration=1e9)),
+    ("accelerations: of another keyframe", received_maps.keyframe_velocities, one_acceleration()),
     ("read-out: of a second", received_maps.keyframe_velocities, velocities(readout=1.0)),
     ("read-out: below zero", received_maps.keyframe_velocities, velocities(readout=-0.01)),
     ("read-out: of no rolling shutter", received_maps.keyframe_velocities, velocities(readout=0.0)),
@@ -148,8 +159,13 @@ def test_velocities_come_as_they_were_sent() -> None:
     header = messages.header(17, "map")
     linear = np.array([[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])
     angular = np.negative(linear)
-    taken = received_maps.keyframe_velocities(messages.keyframe_velocities(header, 0.015, linear, angular))
+    message = messages.keyframe_velocities(header, 0.015, linear, angular, 2.0 * linear, 3.0 * angular)
+    taken = received_maps.keyframe_velocities(message)
     assert (taken.stamp, taken.readout) == (17, 0.015)
+    np.testing.assert_array_equal(taken.linear_acceleration, 2.0 * linear)
+    np.testing.assert_array_equal(taken.angular_acceleration, 3.0 * angular)
+    message.accelerations = []
+    np.testing.assert_array_equal(received_maps.keyframe_velocities(message).angular_acceleration, np.zeros((2, 3)))
     np.testing.assert_array_equal(taken.linear, linear)
     np.testing.assert_array_equal(taken.angular, angular)
 

@@ -47,11 +47,14 @@ def turned(time: float) -> NDArray[np.float64]:
 
 
 def motion_at(time: float, path: Callable[[float], NDArray[np.float64]] = camera_at) -> RowMotion:
+    """Velocities and accelerations of a path by differences."""
     before, now, after = (path(time + step) for step in (-TICK, 0.0, TICK))
-    rate = (after - before) / (2 * TICK)
-    spin = rate[:3, :3] @ now[:3, :3].T
-    angular = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
-    return RowMotion(READOUT, CAMERA.height, rate[:3, 3] - np.cross(angular, now[:3, 3]), angular)
+    rates = []
+    for rate in ((after - before) / (2 * TICK), (after - 2 * now + before) / TICK**2):
+        spin = rate[:3, :3] @ now[:3, :3].T
+        rates += [rate[:3, 3] - spin @ now[:3, 3], 0.5 * np.array([spin[2, 1], spin[0, 2], spin[1, 0]])]
+        rates[-1] -= 0.5 * np.array([spin[1, 2], spin[2, 0], spin[0, 1]])  # the antisymmetric part
+    return RowMotion(READOUT, CAMERA.height, *rates)
 
 
 def walk(
