@@ -44,9 +44,11 @@ class RowMotion:
 
     def __post_init__(self) -> None:
         check_readout(self.readout)
-        for name, value in (("linear", self.linear), ("angular", self.angular)):
+        rates = {"linear velocity": self.linear, "angular velocity": self.angular}
+        rates |= {"linear acceleration": self.linear_acceleration, "angular acceleration": self.angular_acceleration}
+        for name, value in rates.items():
             if np.shape(value) != (3,) or not np.isfinite(value).all():
-                raise InputError(f"the {name} velocity of an image is {value}: it is three finite numbers")
+                raise InputError(f"the {name} of an image is {value}: it is three finite numbers")
 
     def row_times(self, rows: ArrayLike) -> FloatArray:
         """When rows (pixel centres at integers) are exposed, s after the stamp, which is that of the middle row."""

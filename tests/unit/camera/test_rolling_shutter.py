@@ -97,6 +97,10 @@ def test_a_readout_that_no_camera_has_is_refused(readout: float) -> None:
         RowMotion(readout, 720, np.zeros(3), np.zeros(3))
 
 
-def test_a_velocity_of_nan_is_refused() -> None:
-    with pytest.raises(InputError, match="angular velocity"):
-        RowMotion(0.01, 720, np.zeros(3), np.array([0.0, np.nan, 0.0]))
+@pytest.mark.parametrize("number", range(4))
+def test_a_rate_of_nan_is_refused(number: int) -> None:
+    rates = np.zeros((4, 3))
+    rates[number, 1] = np.nan
+    kinds = ["linear velocity", "angular velocity", "linear acceleration", "angular acceleration"]
+    with pytest.raises(InputError, match=kinds[number]):
+        RowMotion(0.01, 720, *rates)

@@ -37,8 +37,13 @@ from pipeprog_node import messages
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map, write_map
 from pipeprog_sfm.alignment.survey_map import MappedPipe, SurveyMap
 
-_SURVEY_TOPICS = {"cloud": "map_points", "poses": "keyframe_poses", "pipes": "pipes", "markers": "pipe_markers"}
-_SURVEY_TOPICS |= {"velocities": "keyframe_velocities"}
+_SURVEY_TOPICS = {
+    "cloud": "map_points",
+    "poses": "keyframe_poses",
+    "velocities": "keyframe_velocities",
+    "pipes": "pipes",
+    "markers": "pipe_markers",
+}
 
 
 def write_survey(

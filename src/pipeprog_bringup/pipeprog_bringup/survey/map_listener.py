@@ -14,7 +14,9 @@ from visualization_msgs.msg import MarkerArray
 from pipeprog_bringup.playback.listener import LastMessages
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
+from pipeprog_node.intake import InvalidMessageError
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION
+from pipeprog_node.received import maps as received_maps
 
 # Maps that wait for their pipes: one is measured, one waits, and the next replaces it. Poses come after each keyframe.
 _CLOUDS, _POSES = 3, 100
@@ -59,6 +61,10 @@ class MapListener:
         self._join()
 
     def _on_velocities(self, message: msg.KeyframeVelocities) -> None:
+        try:
+            received_maps.keyframe_velocities(message)
+        except InvalidMessageError:  # of another node: the outlines are then those of the stamp
+            return
         _keep(self._velocities, message, _POSES)
         self._join()
 

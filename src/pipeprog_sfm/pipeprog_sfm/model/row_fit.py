@@ -42,7 +42,9 @@ class RowFit:
 
     @property
     def sigmas(self) -> FloatArray:
-        """(6,) standard deviations of its velocities if there were no prior."""
+        """(6,) standard deviations of its velocities if there were no prior; infinite where too few rows tell them."""
+        if not self.information.any():
+            return np.full(6, np.inf)
         return np.sqrt(np.diag(np.linalg.pinv(self.information)))
 
     def held_to(self, sigma: float) -> RowMotion:

@@ -138,6 +138,17 @@ def test_a_fit_is_held_to_a_prior_as_if_it_were_made_with_it(told: tuple[Mapper,
     np.testing.assert_allclose(held.linear, narrow.motion.linear, atol=2e-3 * np.median(inside[:, 2]))
 
 
+def test_few_points_tell_no_velocity(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    """A view that has lost its points must not count among those whose rows contradict the spline."""
+    mapper = told[0]
+    keyframe, prior = mapper.map.keyframes[4 * STEP], mapper.map.motions(mapper.map.published)[4 * STEP]
+    fit = fit_rows(np.ones((10, 3)), keyframe, np.arange(10), 0.3, prior, 0.2)
+    assert (fit.sigmas == np.inf).all()
+    for motion in (fit.motion, fit.held_to(0.003)):
+        np.testing.assert_array_equal(motion.linear, prior.linear)
+        np.testing.assert_array_equal(motion.angular, prior.angular)
+
+
 def test_a_sway_between_two_poses_is_told() -> None:
     """1.7 Hz, by poses 0.2 s apart: a cubic spline would have its velocity a fifth too low."""
     model, keyframes = SparseModel(), {}
