@@ -77,6 +77,31 @@ class RolledImage:
         return self.shown(pixels, depths), *steps
 
 
+@dataclass(frozen=True)
+class RowVelocities:
+    """How the map moves, seen from M keyframes, while their rows are read out.
+
+    Attributes:
+        readout: from the first row to the last [s].
+        linear: (M, 3) [m/s].
+        angular: (M, 3) [rad/s].
+        linear_acceleration: (M, 3) [m/s^2].
+        angular_acceleration: (M, 3) [rad/s^2].
+    """
+
+    readout: float
+    linear: FloatArray
+    angular: FloatArray
+    linear_acceleration: FloatArray
+    angular_acceleration: FloatArray
+
+    def rolled(self, index: int, camera: Camera) -> RolledImage:
+        """Where the keyframe of that number, of that calibration, shows what its pose at the stamp would."""
+        rates = self.linear, self.angular, self.linear_acceleration, self.angular_acceleration
+        motion = RowMotion(self.readout, camera.height, *(rate[index] for rate in rates))
+        return RolledImage(motion, camera)
+
+
 @lru_cache(maxsize=8)
 def _lens_rows(camera: Camera) -> FloatArray:
     """Polynomial in x and y (normalised image coordinates) of the row, less y's own, that the lens draws a pixel in."""

@@ -23,6 +23,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_CLOUD_POINTS, MAX_POSES
+from pipeprog_camera.rolled_image import RowVelocities
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.look.colour_view import BoardCircles
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
@@ -30,7 +31,7 @@ from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.markers import LABEL_HEIGHT, PipeMarker, pipe_markers
 from pipeprog_detect.product.pipe_runs import PipeRun
 from pipeprog_detect.product.product import Product
-from pipeprog_detect.types import Cylinder, Pipe, RowVelocities
+from pipeprog_detect.types import Cylinder, Pipe
 from pipeprog_detect.worker import (
     Decoding,
     Event,

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
-from pipeprog_camera.rolling_shutter import RowMotion
 
 
 @dataclass(frozen=True)
@@ -57,31 +56,6 @@ class View:
         camera = self.camera
         lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
         return np.concatenate([self.camera_from_map[:3].ravel(), lens, self.centre])
-
-
-@dataclass(frozen=True)
-class RowVelocities:
-    """How the map moves, seen from M keyframes, while their rows are read out.
-
-    Attributes:
-        readout: from the first row to the last [s].
-        linear: (M, 3) [m/s].
-        angular: (M, 3) [rad/s].
-        linear_acceleration: (M, 3) [m/s^2].
-        angular_acceleration: (M, 3) [rad/s^2].
-    """
-
-    readout: float
-    linear: FloatArray
-    angular: FloatArray
-    linear_acceleration: FloatArray
-    angular_acceleration: FloatArray
-
-    def rolled(self, index: int, camera: Camera) -> RolledImage:
-        """Where the keyframe of that number, of that calibration, shows what its pose at the stamp would."""
-        rates = self.linear, self.angular, self.linear_acceleration, self.angular_acceleration
-        motion = RowMotion(self.readout, camera.height, *(rate[index] for rate in rates))
-        return RolledImage(motion, camera)
 
 
 @dataclass(frozen=True)

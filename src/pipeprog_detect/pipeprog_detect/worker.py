@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.rolled_image import RowVelocities
 from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
@@ -23,7 +24,7 @@ from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import asks_look
 from pipeprog_detect.product.pipe_tracker import PipeTracker
 from pipeprog_detect.product.product import Product, product_of
-from pipeprog_detect.types import Cloud, Cylinder, RowVelocities, View
+from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 
 # Of the process: a tenth of the mapper's CPU share, and less than its depth maps have (5). While keyframes wait the map

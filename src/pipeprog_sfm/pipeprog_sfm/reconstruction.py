@@ -17,6 +17,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
+from pipeprog_camera.rolled_image import RowVelocities
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.alignment.alignment import Alignment, align
 from pipeprog_sfm.alignment.placing import NotAlignedError
@@ -62,25 +63,6 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Velocities:
-    """How the map moves as seen from each camera while its rows are read out: see `RowMotion`.
-
-    Attributes:
-        readout: s.
-        linear: (M, 3) m/s.
-        angular: (M, 3) rad/s.
-        linear_acceleration: (M, 3) m/s^2.
-        angular_acceleration: (M, 3) rad/s^2.
-    """
-
-    readout: float
-    linear: FloatArray
-    angular: FloatArray
-    linear_acceleration: FloatArray
-    angular_acceleration: FloatArray
-
-
-@dataclass(frozen=True)
 class Trajectory:
     """Poses in metres, z up: stamps (M,) int64 and map_from_camera (M, 4, 4) float64, in order of time.
 
@@ -89,7 +71,7 @@ class Trajectory:
 
     stamps: NDArray[np.int64]
     map_from_camera: FloatArray
-    velocities: Velocities | None = None
+    velocities: RowVelocities | None = None
 
     def correction(self, earlier: Trajectory | None) -> float:
         """How far the keyframe is moved that has moved farthest since an earlier trajectory, m."""
@@ -368,7 +350,7 @@ class Reconstruction:
         stamps = np.array(list(poses), np.int64)
         return self._scale, Trajectory(stamps, map_from_camera, self._velocities(stamps, self._scale.scale))
 
-    def _velocities(self, stamps: NDArray[np.int64], scale: float) -> Velocities | None:
+    def _velocities(self, stamps: NDArray[np.int64], scale: float) -> RowVelocities | None:
         """Of the published model's keyframes, zero where unknown; None without a rolling shutter."""
         if not self._map.readout:
             return None
@@ -379,7 +361,7 @@ class Reconstruction:
             motion = motions[int(stamps[row])]
             rates[:2, row] = scale * motion.linear, motion.angular
             rates[2:, row] = scale * motion.linear_acceleration, motion.angular_acceleration
-        return Velocities(self._map.readout, *rates)
+        return RowVelocities(self._map.readout, *rates)
 
     def _align(self, reference: SurveyMap) -> None:
         """Puts the model that is published into the frame of the reference, or notes why not."""

@@ -26,12 +26,13 @@ from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.cloud_io import write_las, write_ply
 from pipeprog_bringup.results.lives import Lives, lives_after
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RowVelocities
 from pipeprog_detect.coverage.survey import SurveyCoverage, survey_coverage, views_of
 from pipeprog_detect.product.boq import PlannedPipe
 from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun
 from pipeprog_detect.product.product import Product
-from pipeprog_detect.types import Cylinder, Pipe, PipeEnd, RowVelocities, View
+from pipeprog_detect.types import Cylinder, Pipe, PipeEnd, View
 from pipeprog_msgs import msg
 from pipeprog_node import messages
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map, write_map

@@ -19,8 +19,8 @@ from pipeprog_bringup.results.results_reader import Results
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_camera.rolled_image import RolledImage
-from pipeprog_detect.types import Cylinder, RowVelocities
+from pipeprog_camera.rolled_image import RolledImage, RowVelocities
+from pipeprog_detect.types import Cylinder
 
 SAMPLES = 25  # positions along an axis at which it is asked whether a keyframe shows it
 CELL = 16  # px of a keyframe, the side of a cell of the depth map of what hides a pipe
@@ -82,8 +82,9 @@ def photographs(
             return none, f"{path} holds no keyframe of trajectory.tum"
         chosen = [best_views(*pipe) for pipe in _each_pipe(sight(views, results.cylinders, points))]
         velocities = _velocities(bag, len(results.stamps))
-        cameras_of = [(row, camera) for row, (camera, _) in zip(rows, views, strict=True)]
-        rolled = [velocities.rolled(*each) if velocities else None for each in cameras_of]
+        rolled = [
+            velocities.rolled(row, camera) if velocities else None for row, (camera, _) in zip(rows, views, strict=True)
+        ]
         return _cropped(bag, results, rows, views, rolled, chosen, colors), ""
     except (InputError, ValueError) as error:
         return none, str(error)
