@@ -41,6 +41,8 @@ from sitegen.walk import Walk
 
 _FOCAL_OVER_WIDTH = 0.714  # 70 degrees across, a phone's main camera
 _SIZES = {"vga": (640, 480), "480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "4k": (3840, 2160)}
+_FISHEYE = (-0.03, 0.008, -0.003, 0.0005)  # k1 to k4, of the size that calibrations of such lenses have
+_GAP = 1.0  # s; the longest that users of Spot's driver tell of
 _PREVIEW_WIDTH = 320  # px; the thinnest pipe is then 2 px wide at 2 m
 _LAB_SECONDS = 16.0
 _MOTION_SEED = 1 << 20  # beyond the numbers of frames, which are their seeds
@@ -99,7 +101,10 @@ def make_site(
     robot: Annotated[bool, typer.Option(help="also a robot's /odom, /imu and /tf_static")] = False,
     odometry_error: Annotated[float, typer.Option(help="percent by which odometry's lengths are off")] = 0.0,
     rig: Annotated[int, typer.Option(help="cameras of the robot, with --robot", min=1, max=MAX_RIG)] = 1,
+    turned: Annotated[bool, typer.Option("--turned", help="they lie on their sides and heads, as on Spot")] = False,
+    fisheye: Annotated[bool, typer.Option("--fisheye", help="equidistant lenses, as robots have them")] = False,
     drop: Annotated[float, typer.Option(help="share of the images that get lost", min=0, max=0.9)] = 0.0,
+    gaps: Annotated[int, typer.Option(help="times that no image comes for a second", min=0)] = 0,
     grey: Annotated[bool, typer.Option(help="grey images")] = False,
     surface: Annotated[bool, typer.Option(help="also NAME.surface.npz: true surface points and their pipes")] = False,
     board_error_mm: Annotated[float, typer.Option(help="standard deviation of a printed circle's place", min=0)] = 0.0,
@@ -108,7 +113,7 @@ def make_site(
 ) -> None:
     """Build a site from a seed, walk a camera through it, and write what it sees and what is true."""
     console = Console(stderr=True)
-    lens = lens_of(size, distortion)
+    lens = fisheye_of(size) if fisheye else lens_of(size, distortion)
     rng = np.random.default_rng(seed)
     build = _BUILDERS[layout]
     try:
@@ -124,8 +129,9 @@ def make_site(
     if seconds is None:
         seconds = walk.duration if layout == Layout.field else _LAB_SECONDS
     times = np.arange(max(math.floor(seconds * fps), 1)) / fps
-    walks: list[Walk | MountedWalk] = [walk, *(MountedWalk(walk, mounted(number)) for number in range(1, rig))]
-    taken = _taken(times, rig, drop, np.random.default_rng([seed, _DROP_SEED]))
+    mounts = [mounted(number, turned) for number in range(rig)]
+    walks = [MountedWalk(walk, mount) for mount in mounts]
+    taken = _taken(times, rig, drop, gaps, np.random.default_rng([seed, _DROP_SEED]))
     poses = _poses(walks, taken)
 
     preview = lens.reduced(max(lens.width // _PREVIEW_WIDTH, 1))
@@ -146,7 +152,7 @@ def make_site(
     shots = [Shot(scene, lens, each, sensor, grey) for each in walks]
     frames = _frames(shots, taken, seed + _NIGHT_SEED * second_night_later, jobs)
     motion_rng = np.random.default_rng([seed, _MOTION_SEED])
-    motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng, rig)
+    motion = robot_messages(walk, Robot(odometry_error / 100), float(times[-1]), FIRST_STAMP, motion_rng, mounts)
     shown = track(frames, total=len(taken), description=out.name, console=console)
     write_bag(out, camera_info(lens, focal_error / 100, hide_distortion), shown, motion if robot else ())
     console.print(f"{out}: {len(taken)} frames, {len(site.pipes)} pipes, {out.stat().st_size / 1e6:.1f} MB")
@@ -158,7 +164,7 @@ class Shot:
 
     scene: Scene
     lens: Lens
-    walk: Walk | MountedWalk
+    walk: MountedWalk
     sensor: Sensor
     is_grey: bool = False
 
@@ -169,13 +175,19 @@ class Shot:
         return compress(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if self.is_grey else image, self.sensor)
 
 
-def _taken(times: NDArray[np.float64], cameras: int, drop: float, rng: np.random.Generator) -> list[tuple[float, int]]:
-    """Time and number of the camera of each image that does not get lost."""
+def _taken(
+    times: NDArray[np.float64], cameras: int, drop: float, gaps: int, rng: np.random.Generator
+) -> list[tuple[float, int]]:
+    """Time and number of the camera of each image that does not get lost; none comes in `gaps` of a second each."""
     taken = [(float(time), camera) for time in times for camera in range(cameras)]
-    return [each for each, kept in zip(taken, rng.random(len(taken)) >= drop, strict=True) if kept]
+    kept = rng.random(len(taken)) >= drop
+    moments = np.repeat(times, cameras)
+    for begin in rng.uniform(times[0], times[-1], gaps):
+        kept &= (moments < begin) | (moments >= begin + _GAP)
+    return [each for each, is_kept in zip(taken, kept, strict=True) if is_kept]
 
 
-def _poses(walks: Sequence[Walk | MountedWalk], taken: Sequence[tuple[float, int]]) -> NDArray[np.float64]:
+def _poses(walks: Sequence[MountedWalk], taken: Sequence[tuple[float, int]]) -> NDArray[np.float64]:
     """(N, 4, 4) world_from_camera of the images, in their order."""
     moments, cameras = (np.array(column) for column in zip(*taken, strict=True))
     poses = np.empty((len(taken), 4, 4))
@@ -207,6 +219,13 @@ def lens_of(size: Size, distortion: str, focal_over_width: float = _FOCAL_OVER_W
     width, height = _SIZES[size.value]
     focal = focal_over_width * width
     return Lens(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, (k1, k2, p1, p2, k3))
+
+
+def fisheye_of(size: Size) -> Lens:
+    """A wide lens: as sharp in the middle as the others, 82 degrees across in place of 70."""
+    width, height = _SIZES[size.value]
+    focal = _FOCAL_OVER_WIDTH * width
+    return Lens(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, _FISHEYE, is_fisheye=True)
 
 
 def _refuse_hidden(console: Console, site: Site, seen: Sequence[Coverage], allowed: bool) -> None:

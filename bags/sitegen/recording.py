@@ -68,8 +68,8 @@ def camera_info(lens: Lens, focal_error: float, leave_out_distortion: bool) -> d
     return {
         "height": lens.height,
         "width": lens.width,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5 if leave_out_distortion else list(lens.distortion),
+        "distortion_model": "equidistant" if lens.is_fisheye else "plumb_bob",
+        "d": [0.0] * len(lens.distortion) if leave_out_distortion else list(lens.distortion),
         "k": [fx, 0.0, lens.cx, 0.0, fy, lens.cy, 0.0, 0.0, 1.0],
         "r": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "p": [fx, 0.0, lens.cx, 0.0, 0.0, fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0],
@@ -125,6 +125,7 @@ def truth(site: Site, lens: Lens, fps: float, poses: FloatArray, seen: Sequence[
         "fy": lens.fy,
         "cx": lens.cx + 0.5,
         "cy": lens.cy + 0.5,
+        "distortion_model": "equidistant" if lens.is_fisheye else "plumb_bob",
         "distortion": list(lens.distortion),
         "planned_radii": list(site.planned_radii),
         "pipes": [

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -39,7 +39,10 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Lens:
-    """The true camera: ROS pixel convention (integers at pixel centres), plumb_bob distortion k1 k2 p1 p2 k3."""
+    """The true camera: ROS pixel convention (integers at pixel centres).
+
+    `distortion` is k1 k2 p1 p2 k3 of plumb_bob or, of a fisheye (equidistant), k1 k2 k3 k4.
+    """
 
     width: int
     height: int
@@ -47,22 +50,24 @@ class Lens:
     fy: float
     cx: float
     cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    is_fisheye: bool = False
 
     def row(self) -> FloatArray:
-        """fx, fy, cx, cy and the five coefficients."""
-        return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
+        """fx, fy, cx, cy, five coefficients (the last one of a fisheye is 0), and whether it is a fisheye."""
+        coefficients = (*self.distortion, 0.0)[:5]
+        return np.array([self.fx, self.fy, self.cx, self.cy, *coefficients, float(self.is_fisheye)])
 
     def reduced(self, factor: int) -> Lens:
         """The same view with `factor` times fewer pixels each way."""
-        return Lens(
-            self.width // factor,
-            self.height // factor,
-            self.fx / factor,
-            self.fy / factor,
-            (self.cx + 0.5) / factor - 0.5,
-            (self.cy + 0.5) / factor - 0.5,
-            self.distortion,
+        return replace(
+            self,
+            width=self.width // factor,
+            height=self.height // factor,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=(self.cx + 0.5) / factor - 0.5,
+            cy=(self.cy + 0.5) / factor - 0.5,
         )
 
 
@@ -100,9 +105,30 @@ def _edge_pattern(bits: int) -> FloatArray:
 
 
 @njit(nogil=True)
+def _fisheye_direction(xd: float, yd: float, lens: FloatArray) -> tuple[float, float, float]:
+    """As `_direction`: Kannala and Brandt, r = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) at an angle t to the axis."""
+    r = math.sqrt(xd * xd + yd * yd)
+    if r == 0.0:
+        return 0.0, 0.0, 1.0
+    t = r
+    for _ in range(100):
+        t2 = t * t
+        told = t * (1.0 + t2 * (lens[4] + t2 * (lens[5] + t2 * (lens[6] + t2 * lens[7]))))
+        slope = 1.0 + t2 * (3.0 * lens[4] + t2 * (5.0 * lens[5] + t2 * (7.0 * lens[6] + t2 * 9.0 * lens[7])))
+        moved = (r - told) / slope
+        t += moved
+        if abs(moved) < 1e-12:
+            break
+    s = math.sin(t) / r
+    return s * xd, s * yd, math.cos(t)
+
+
+@njit(nogil=True)
 def _direction(u: float, v: float, lens: FloatArray) -> tuple[float, float, float]:
-    """Unit direction, in the optical frame, of the ray through a pixel (distortion inverted by fixed point)."""
+    """Unit direction, in the optical frame, of the ray through a pixel (distortion inverted)."""
     xd, yd = (u - lens[2]) / lens[0], (v - lens[3]) / lens[1]
+    if lens[9] != 0.0:
+        return _fisheye_direction(xd, yd, lens)
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
     x, y = xd, yd
     if k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0:

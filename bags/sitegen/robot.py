@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,8 @@ CAMERA_FRAME = "camera_optical"
 # Spot, neighbours see the same wall from a hand's breadth apart and from different sides.
 _RIG = ((0.0, 0.0), (0.25, -20.0), (-0.25, 20.0), (0.12, 12.0), (-0.12, -12.0))
 MAX_RIG = len(_RIG)
+# Degrees by which cameras are turned about where they look, in the same order: those of Spot's images are turned so.
+_TURNS = (0.0, -102.0, -78.0, 180.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class MountedWalk:
-    """The walk of another camera of the robot, mounted at first_from_camera (4, 4)."""
+    """The walk of a camera of the robot, mounted at first_from_camera (4, 4)."""
 
     walk: Walk
     first_from_camera: FloatArray
@@ -55,11 +57,11 @@ class MountedWalk:
         return self.walk.poses(seconds) @ self.first_from_camera
 
 
-def mounted(number: int) -> FloatArray:
-    """first_from_camera (4, 4) of the camera of this number, 0 to MAX_RIG - 1."""
+def mounted(number: int, is_turned: bool = False) -> FloatArray:
+    """first_from_camera (4, 4) of the camera of this number, 0 to MAX_RIG - 1; turned: as it is on Spot."""
     along, degrees = _RIG[number]
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    pose[:3, :3] = Rotation.from_euler("YZ", [degrees, _TURNS[number] * is_turned], degrees=True).as_matrix()
     pose[0, 3] = along
     return pose
 
@@ -80,12 +82,20 @@ class RobotMessage:
 
 
 def robot_messages(
-    walk: Walk, robot: Robot, seconds: float, first_stamp: int, rng: np.random.Generator, cameras: int = 1
+    walk: Walk,
+    robot: Robot,
+    seconds: float,
+    first_stamp: int,
+    rng: np.random.Generator,
+    mounts: Sequence[FloatArray] = (np.eye(4),),
 ) -> Iterator[RobotMessage]:
-    """Messages in order of time: /tf_static, then /odom and /imu from shortly before the first frame on."""
+    """Messages in order of time: /tf_static, then /odom and /imu from shortly before the first frame on.
+
+    `mounts`: first_from_camera (4, 4) of each camera.
+    """
     edges = [
-        _transform("base_link", camera_frame(number), BASE_FROM_CAMERA @ mounted(number), first_stamp)
-        for number in range(cameras)
+        _transform("base_link", camera_frame(number), BASE_FROM_CAMERA @ mount, first_stamp)
+        for number, mount in enumerate(mounts)
     ]
     yield RobotMessage("/tf_static", "tf2_msgs/msg/TFMessage", {"transforms": edges}, first_stamp)
     messages = [*_odometry(walk, robot, seconds, first_stamp, rng), *_imu(walk, robot, seconds, first_stamp, rng)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sitegen.primitives import Material, cylinder, disc, frame, rectangle, unit
-from sitegen.render import Lens, build_scene, render, trace
+from sitegen.render import Lens, build_scene, pixel_directions, render, trace
 from sitegen.sensor import Sensor, develop
 from sitegen.walk import look
 
@@ -118,6 +118,16 @@ def test_the_lens_distorts_as_opencv_does() -> None:
     rows, columns = np.indices((480, 640))
     assert np.abs(found - np.stack([columns, rows], -1)).max() < 1e-5
     assert np.allclose(np.linalg.norm(points - pose[:3, 3], axis=-1), ranges)
+
+
+def test_a_fisheye_projects_as_opencv_has_it() -> None:
+    lens = Lens(640, 480, 300.0, 303.0, 322.0, 236.0, (-0.03, 0.008, -0.003, 0.0005), is_fisheye=True)
+    offsets = np.zeros((1, 2))
+    directions = pixel_directions(lens, offsets)[0].reshape(-1, 1, 2)
+    k = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
+    found = cv2.fisheye.distortPoints(directions, k, np.array(lens.distortion)).reshape(480, 640, 2)
+    rows, columns = np.indices((480, 640))
+    assert np.abs(found - np.stack([columns, rows], -1)).max() < 1e-6
 
 
 def test_rolling_shutter_reads_each_row_with_its_own_pose() -> None:

@@ -95,6 +95,27 @@ def test_the_truth_of_a_rig_has_a_pose_for_each_image_in_their_order(tmp_path: P
         assert body == pytest.approx(bodies[first], abs=1e-9)
 
 
+def test_turned_cameras_look_where_the_others_do_and_have_the_vertical_elsewhere() -> None:
+    for number, degrees in enumerate((0, -102, -78, 180, 0)):
+        straight, turned = mounted(number), mounted(number, is_turned=True)
+        assert turned[:3, 2:] == pytest.approx(straight[:3, 2:])
+        by = straight[:3, :3].T @ turned[:3, :3]
+        assert np.degrees(np.arctan2(by[1, 0], by[0, 0])) % 360 == pytest.approx(degrees % 360)
+
+
+def test_in_a_gap_no_camera_sends_an_image_for_a_second(tmp_path: Path) -> None:
+    out = tmp_path / "gap.mcap"
+    run(out, "--rig", "2", "--gaps", "1", "--size", "vga", "--fps", "2", "--seconds", "2", "--fisheye")
+    sent = messages(out)
+    stamps = {stamp for topic, images in sent.items() if topic.endswith("compressed") for stamp, _ in images}
+    assert 0 < len(stamps) < 4
+    info = sent["/camera/camera_info"][0][1]
+    assert (info.distortion_model, len(info.d)) == ("equidistant", 4)
+    truth = json.loads(out.with_suffix(".truth.json").read_text())
+    assert truth["distortion_model"] == "equidistant"
+    assert list(info.d) == truth["distortion"]
+
+
 def test_boq_and_board_read_as_yaml(recording: Path) -> None:
     boq = yaml.safe_load(recording.with_suffix(".boq.yaml").read_text())
     assert [c["outer_radius_mm"] for c in boq["classes"]] == [8.6, 36.5, 57.5, 84.1, 109.5]
