@@ -88,7 +88,7 @@ FOLDERS = {
         "commands": {  # as thin as they are, they stand above all
             *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
             *("console", "footage", "plane_from_keyframe", "recording", "recording_check", "comparison", "patrol"),
-            "calibrate",
+            *("calibrate", "simulated_patrol"),
         },
         "survey": {"playback", "recording", "results", "comparison"},
         "patrol": {"results"},

@@ -26,6 +26,7 @@ from pipeprog_bringup.commands.patrol import patrol
 from pipeprog_bringup.commands.replay import replay
 from pipeprog_bringup.commands.report import report
 from pipeprog_bringup.commands.score import score
+from pipeprog_bringup.commands.simulate_patrol import simulate_patrol
 from pipeprog_bringup.commands.speech import fail
 from pipeprog_bringup.commands.view import view
 
@@ -40,7 +41,7 @@ app = typer.Typer(
 )
 for panel, commands in {
     "From recordings": (check, replay, fleet, detect),
-    "On a robot": (patrol,),
+    "On a robot": (patrol, simulate_patrol),
     "To recordings": (ingest, board, calibrate),
     "From results": (score, report, compare, view, export),
 }.items():

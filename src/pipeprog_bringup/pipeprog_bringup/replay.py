@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
-
 from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph
 from pipeprog_bringup.playback.private_network import private_network
+from pipeprog_bringup.playback.ros_context import ros_context
 from pipeprog_bringup.playback.scratch import check_room, scratch_folder
 from pipeprog_bringup.playback.session import Session, State
 from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, seen_by, write_survey
@@ -106,7 +103,7 @@ def replay(
         parameters = _parameters(request, inputs.configs, folder.file("colmap"))
         parameters["frames"]["cameras"] = " ".join(camera.frame_id for camera in inputs.bag.rig)
         session = Session(inputs.bag, request.rate, report)
-        with private_network(scratch), Graph(parameters, scratch, modules) as graph, _ros():
+        with private_network(scratch), Graph(parameters, scratch, modules) as graph, ros_context():
             survey, status = session.run(graph)
         with folder.file("out.mcap").open("wb") as stream, BagWriter(stream) as recording:
             recording.describe(_described(request))
@@ -153,12 +150,12 @@ def _read(request: Request) -> _Inputs:
         raise InputError(f"--rate {request.rate:g}: give a factor above zero, 1 for real time")
     if "frames.lockstep" in _names(request):
         raise InputError("--set frames.lockstep: a replay is always in lockstep, or it would lose frames")
-    configs = effective([*_told_by(bag, _names(request)), *request.overrides])
+    configs = effective([*told_by(bag, _names(request)), *request.overrides])
     configs["frames"] = dataclasses.replace(configs["frames"], lockstep=True)
     return _Inputs(bag, boq, board_file, configs, read_map(request.reference / MAP_FILE) if request.reference else None)
 
 
-def _told_by(bag: Bag, given: set[str]) -> list[str]:
+def told_by(bag: Bag, given: set[str]) -> list[str]:
     """Settings that a recording tells of its camera, those that the user has given left out."""
     told: dict[str, float] = {}
     if bag.readout is not None:
@@ -227,17 +224,3 @@ def _facts(request: Request, inputs: _Inputs, outcome: Outcome, timings: dict[st
         "seeds": {node: config.seed for node, config in inputs.configs.items() if hasattr(config, "seed")},
         "timings_s": timings,
     }
-
-
-@contextlib.contextmanager
-def _ros() -> Iterator[None]:
-    """rclpy for this process; Ctrl-C stays Python's KeyboardInterrupt. Raises InputError where ROS does not start."""
-    try:
-        rclpy.init(args=["--ros-args", "--log-level", "error"], signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        reason = str(error).partition(", at /")[0]  # without the line of ROS's source
-        raise InputError(f"ROS 2 does not start: {reason}; look at the environment variables ROS_*") from None
-    try:
-        yield
-    finally:
-        rclpy.try_shutdown()

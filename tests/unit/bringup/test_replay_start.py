@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipeprog_bringup import replay
+from pipeprog_bringup.playback.ros_context import ros_context
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import readout_key
 from pipeprog_bringup.recording.bag_writer import BagWriter
@@ -19,7 +20,7 @@ BOQ = Path(__file__).parents[3] / "bags" / "demo.boq.yaml"
 
 def test_a_domain_that_is_none_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
-    with pytest.raises(InputError, match=r"ROS_DOMAIN_ID is not an integral number; look at"), replay._ros():
+    with pytest.raises(InputError, match=r"ROS_DOMAIN_ID is not an integral number; look at"), ros_context():
         pass
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -85,15 +86,11 @@ class Player:
 
     def _send_motion(self, message: MotionMessage) -> None:
         """Pass a message of motion on; a damaged one is left out."""
+        content = motion_content(message)
+        if content is None:
+            self._log.skip_motion(message.topic)
+            return
         publisher = self._motion[message.topic]
-        if len(message.data) > MAX_SMALL_MESSAGE:  # what it claims to hold would be allocated first
-            self._log.skip_motion(message.topic)
-            return
-        try:
-            content = deserialize_message(message.data, publisher.msg_type)
-        except Exception:  # rclpy raises whatever its type support makes of the bytes
-            self._log.skip_motion(message.topic)
-            return
         publisher.publish(content)
         self.motion_sent += len(content.transforms) if isinstance(content, TFMessage) else 1
         if self.motion_sent % MOTION_IN_FLIGHT == 0:
@@ -105,3 +102,13 @@ def calibration(message: ImageMessage) -> CameraInfo:
     info = deserialize_message(message.camera_info, CameraInfo)
     info.header = messages.header(message.stamp, message.frame_id)
     return info
+
+
+def motion_content(message: MotionMessage) -> Any:
+    """A message of motion, decoded; None where it is damaged."""
+    if len(message.data) > MAX_SMALL_MESSAGE:  # what it claims to hold would be allocated first
+        return None
+    try:
+        return deserialize_message(message.data, MOTION_TYPES[message.topic])
+    except Exception:  # rclpy raises whatever its type support makes of the bytes
+        return None

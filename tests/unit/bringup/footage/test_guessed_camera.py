@@ -15,7 +15,7 @@ from pipeprog_bringup.footage.quicktime import read_movie
 from pipeprog_bringup.footage.shot import Excerpt
 from pipeprog_bringup.ingest import Request, ingest
 from pipeprog_bringup.recording.bag import Bag
-from pipeprog_bringup.replay import _told_by
+from pipeprog_bringup.replay import told_by
 from pipeprog_camera.errors import InputError
 
 NAMES = ("com.apple.quicktime.make", "com.apple.quicktime.camera.focal_length.35mm_equivalent")
@@ -70,5 +70,5 @@ def test_the_survey_learns_that_it_is_a_guess(tmp_path: Path) -> None:
     assert any("guess to 5%" in note for note in made.notes)
     bag = Bag.open(tmp_path / "walk.mcap")
     assert bag.focal_sigma == 0.05
-    assert _told_by(bag, set()) == ["sfm.calibration.focal_sigma=0.05", "sfm.calibration.distortion_sigma=0.1"]
-    assert _told_by(bag, {"sfm.calibration.focal_sigma"}) == ["sfm.calibration.distortion_sigma=0.1"]
+    assert told_by(bag, set()) == ["sfm.calibration.focal_sigma=0.05", "sfm.calibration.distortion_sigma=0.1"]
+    assert told_by(bag, {"sfm.calibration.focal_sigma"}) == ["sfm.calibration.distortion_sigma=0.1"]
