@@ -133,6 +133,8 @@ def make_site(
     walks = [MountedWalk(walk, mount) for mount in mounts]
     taken = _taken(times, rig, drop, gaps, np.random.default_rng([seed, _DROP_SEED]))
     poses = _poses(walks, taken)
+    # As results have them: a nanosecond apart where cameras are triggered together.
+    stamps = [_stamp(time) + camera for time, camera in taken]
 
     preview = lens.reduced(max(lens.width // _PREVIEW_WIDTH, 1))
     seen = coverage(scene, site.pipes, preview, poses)
@@ -140,7 +142,7 @@ def make_site(
 
     out.parent.mkdir(parents=True, exist_ok=True)
     stem = out.with_suffix("")
-    write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, [c.share for c in seen]))
+    write_truth(Path(f"{stem}.truth.json"), truth(site, lens, fps, poses, stamps, [c.share for c in seen]))
     write_boq(Path(f"{stem}.boq.yaml"), site)
     if site.boards:
         write_boards(Path(f"{stem}.board.yaml"), len(site.boards))
@@ -196,6 +198,11 @@ def _poses(walks: Sequence[MountedWalk], taken: Sequence[tuple[float, int]]) -> 
     return poses
 
 
+def _stamp(time: float) -> int:
+    """Stamp, ns, of an image at a time, s."""
+    return FIRST_STAMP + round(time * 1e9)
+
+
 def _frames(
     shots: Sequence[Shot], taken: Sequence[tuple[float, int]], seed: int, jobs: int
 ) -> Iterator[tuple[int, int, bytes]]:
@@ -203,7 +210,7 @@ def _frames(
 
     def make(index: int) -> tuple[int, int, bytes]:
         time, camera = taken[index]
-        return FIRST_STAMP + round(time * 1e9), camera, shots[camera].jpeg(time, np.random.default_rng([seed, index]))
+        return _stamp(time), camera, shots[camera].jpeg(time, np.random.default_rng([seed, index]))
 
     with ThreadPoolExecutor(jobs) as pool:
         for first in range(0, len(taken), jobs):

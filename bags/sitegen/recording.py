@@ -112,8 +112,10 @@ def write_bag(
     part.replace(path)
 
 
-def truth(site: Site, lens: Lens, fps: float, poses: FloatArray, seen: Sequence[float]) -> dict[str, Any]:
-    """What is true of a recording, as plain values; (N, 4, 4) poses at the middle of each exposure.
+def truth(
+    site: Site, lens: Lens, fps: float, poses: FloatArray, stamps: Sequence[int], seen: Sequence[float]
+) -> dict[str, Any]:
+    """What is true of a recording, as plain values; (N, 4, 4) poses at the middle of each exposure, at `stamps` [ns].
 
     `seen` is the share of each pipe's length that at least three frames show.
     """
@@ -145,6 +147,7 @@ def truth(site: Site, lens: Lens, fps: float, poses: FloatArray, seen: Sequence[
         "boards": [board.tolist() for board in site.boards],
         "board_radius": BOARD_CIRCLE_RADIUS,
         "camera_to_world": poses.tolist(),
+        "stamps": list(stamps),
         "note": "metres; camera_to_world: optical frame, one per image, at the middle of its exposure; "
         "cx, cy: corner convention (ROS CameraInfo is 0.5 less); board_radius: circle radius",
     }

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_bringup.results.pipes_file import number, rows_of, vector
 from pipeprog_camera.arrays import FloatArray
@@ -46,11 +47,15 @@ class Result:
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth in its own frame `world`: pipes, cylinders to ignore, poses (N, 4, 4) of each frame's camera."""
+    """Ground truth in its own frame `world`: pipes, cylinders to ignore, poses (N, 4, 4) of each frame's camera.
+
+    `stamps`: of the frames, (N,) int64 ns; None where the truth has none.
+    """
 
     pipes: tuple[Segment, ...]
     ignore: tuple[Segment, ...]
     world_from_camera: FloatArray
+    stamps: NDArray[np.int64] | None = None
 
 
 def read_result(path: Path) -> Result:
@@ -84,9 +89,10 @@ def read_truth(path: Path) -> Truth:
         ignored = _numbered({"ignore": [], **content}, "ignore")
         ignore = tuple(_segment(pipe, "ignore", f"cylinder {n} to ignore") for n, pipe in ignored)
         poses = _poses(content.get("camera_to_world", []))
+        stamps = _stamps(content["stamps"], len(poses)) if "stamps" in content else None
     except InputError as error:
         raise InputError(f"{path} is no truth file ({error}): it needs pipes with start, end, radius") from None
-    return Truth(pipes, ignore, poses)
+    return Truth(pipes, ignore, poses, stamps)
 
 
 def _numbered(content: dict[str, Any], key: str) -> Iterable[tuple[int, dict[str, Any]]]:
@@ -102,6 +108,15 @@ def _poses(value: Any) -> FloatArray:
     if not (np.abs(poses) <= MAX_COORDINATE).all():
         raise InputError(f"camera_to_world holds more than {MAX_COORDINATE:g} m")
     return poses
+
+
+def _stamps(value: Any, count: int) -> NDArray[np.int64]:
+    """(N,) stamps [ns] of `count` poses."""
+    if not isinstance(value, list) or len(value) != count or not all(type(one) is int and one >= 0 for one in value):
+        raise InputError(f"stamps is {shown(value)}, not a list of {count} times in ns, one for each pose")
+    if max(value, default=0) > np.iinfo(np.int64).max:
+        raise InputError(f"stamps holds {max(value)}: a time in ns has 63 bits at most")
+    return np.array(value, np.int64)
 
 
 def _segment(entry: dict[str, Any], name: Any, where: str) -> Segment:

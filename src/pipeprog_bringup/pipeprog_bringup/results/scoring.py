@@ -36,9 +36,9 @@ SIGMAS = 3.0
 def score_files(pipes_json: Path, truth_json: Path) -> dict[str, Any]:
     """Score `pipes_json`, aligned by the trajectory.tum and frames.csv beside it (identity where there is none).
 
-    The folder of these files may be given in place of `pipes_json`. Frames correspond by their number: row i of
-    frames.csv is the truth's pose i. Raises InputError where a file cannot be read or the trajectory cannot be laid
-    onto the truth.
+    The folder of these files may be given in place of `pipes_json`. Frames correspond by their stamps, and by their
+    number where the truth has none of these stamps: row i of frames.csv is then the truth's pose i. Raises InputError
+    where a file cannot be read or the trajectory cannot be laid onto the truth.
     """
     if pipes_json.is_dir():
         pipes_json /= "pipes.json"

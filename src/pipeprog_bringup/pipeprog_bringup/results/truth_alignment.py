@@ -65,6 +65,8 @@ def _pairs(trajectory_file: Path, truth_json: Path, truth: Truth) -> tuple[Float
     """Poses of the run and of the truth that belong together."""
     stamps, map_from_camera = read_trajectory(trajectory_file)
     frame_stamps = read_frame_stamps(trajectory_file.parent / "frames.csv")
+    if truth.stamps is not None and np.isin(frame_stamps, truth.stamps).any():
+        frame_stamps = truth.stamps
     if len(frame_stamps) > len(truth.world_from_camera):
         raise InputError(
             f"{truth_json} has {len(truth.world_from_camera)} poses but {trajectory_file.parent / 'frames.csv'} "

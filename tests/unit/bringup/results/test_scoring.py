@@ -280,6 +280,27 @@ def test_without_a_trajectory_the_frames_are_taken_as_one(tmp_path: Path) -> Non
     assert counts(figures["detection"]) == (3, 0, 0)
 
 
+def test_frames_are_found_by_the_stamps_of_the_truth_in_whatever_order_they_came(tmp_path: Path) -> None:
+    pipes, truth = write_case(tmp_path, WORLD_FROM_MAP, [1, 4, 5, 9, 15, 19])
+    lines = (tmp_path / "frames.csv").read_text().splitlines(keepends=True)
+    stamps = [int(line.partition(",")[0]) for line in lines[1:]]
+    content = json.loads(truth.read_text()) | {"stamps": stamps}
+    (tmp_path / "frames.csv").write_text("".join([lines[0], *reversed(lines[2:])]))  # the first one was lost
+    assert score_files(pipes, truth)["trajectory"]["rms_rigid_mm"] > 1.0
+    truth.write_text(json.dumps(content))
+    assert score_files(pipes, truth)["trajectory"]["rms_rigid_mm"] < 1e-4
+    truth.write_text(json.dumps(content | {"stamps": [stamp + 10**12 for stamp in stamps]}))
+    assert score_files(pipes, truth)["trajectory"]["rms_rigid_mm"] > 1.0
+
+
+@pytest.mark.parametrize("stamps", [3, [1], ["a"] * 20, [-1] * 20, [1 << 63] * 20])
+def test_stamps_of_a_truth_that_are_none_are_an_error(tmp_path: Path, stamps: object) -> None:
+    pipes, truth = write_case(tmp_path, np.eye(4), [0, 5, 9])
+    truth.write_text(json.dumps(json.loads(truth.read_text()) | {"stamps": stamps}))
+    with pytest.raises(InputError, match="stamps"):
+        score_files(pipes, truth)
+
+
 def test_the_truth_of_another_recording_is_an_error(tmp_path: Path) -> None:
     pipes, truth = write_case(tmp_path, np.eye(4), [0, 5, 9])
     content = json.loads(truth.read_text())
