@@ -27,13 +27,12 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_srvs.srv import Trigger
 
 from benchmarks.recordings import ROOT
-from pipeprog_bringup.playback.node_processes import NODE_MODULES
 from pipeprog_bringup.recording.bag import Bag, ImageMessage
+from pipeprog_bringup.simulated_patrol import MODULES
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray
 from pipeprog_node import messages, qos
 
-MODULES = NODE_MODULES | {"survey": "pipeprog_bringup.survey.node"}
 BOQ, BOARD, DEMO = (ROOT / "bags" / f"demo.{end}" for end in ("boq.yaml", "board.yaml", "mcap"))
 COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # what is measured is the graph, not its accuracy
 RESPAWN_DELAY = 2.0  # s, as the launch file has it

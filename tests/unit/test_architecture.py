@@ -45,7 +45,8 @@ GLUE = {
         "worker",
     },
     "pipeprog_bringup": {
-        *{"replay", "session", "connections", "player", "listener", "survey_writer", "outline_marker"},
+        *{"session", "connections", "player", "listener", "survey_writer", "outline_marker", "ros_context"},
+        *{"simulated_robot", "simulated_patrol"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},
         *{"survey_client", "conduct", "alignment_result", "waiting_client", "progress", "takeover"},
     },
