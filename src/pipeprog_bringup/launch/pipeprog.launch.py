@@ -107,14 +107,16 @@ def pipeprog_node(name: str, parameters: dict, remappings: list) -> Node:
         namespace=LaunchConfiguration("namespace"),
         parameters=[LaunchConfiguration("params_file"), {"use_sim_time": truth("use_sim_time"), **parameters}],
         remappings=remappings,
-        ros_arguments=[
-            *("--log-level", LaunchConfiguration("log_level")),
-            *("--enclave", [LaunchConfiguration("enclaves"), "/", name]),
-        ],
+        ros_arguments=ros_arguments(name),
         output="screen",
         respawn=True,  # a node that dies is there for the next survey
         respawn_delay=RESPAWN_DELAY,
     )
+
+
+def ros_arguments(name: str) -> list:
+    """What the process of every node gets: its least severity of logs, and its enclave."""
+    return ["--log-level", LaunchConfiguration("log_level"), "--enclave", [LaunchConfiguration("enclaves"), "/", name]]
 
 
 def truth(argument: str) -> ParameterValue:
@@ -136,6 +138,7 @@ def survey_node(remappings: list) -> LifecycleNode:
             {"results": text("results"), "use_sim_time": truth("use_sim_time"), **files},
         ],
         remappings=remappings,
+        ros_arguments=ros_arguments("survey"),
         output="screen",
         respawn=True,  # it goes on with a survey, and waits for a lifecycle manager without one
         respawn_delay=RESPAWN_DELAY,
