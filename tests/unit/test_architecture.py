@@ -89,7 +89,7 @@ FOLDERS = {
         "commands": {  # as thin as they are, they stand above all
             *("playback", "view", "export", "report", "results", "replay", "detect_cloud", "ingest", "survey_fleet"),
             *("console", "footage", "plane_from_keyframe", "recording", "recording_check", "comparison", "patrol"),
-            *("calibrate", "simulated_patrol"),
+            *("calibrate", "simulated_patrol", "access_policy"),
         },
         "survey": {"playback", "recording", "results", "comparison"},
         "patrol": {"results"},

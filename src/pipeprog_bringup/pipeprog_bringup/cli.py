@@ -23,6 +23,7 @@ from pipeprog_bringup.commands.export import export
 from pipeprog_bringup.commands.fleet import fleet
 from pipeprog_bringup.commands.ingest import ingest
 from pipeprog_bringup.commands.patrol import patrol
+from pipeprog_bringup.commands.policy import policy
 from pipeprog_bringup.commands.replay import replay
 from pipeprog_bringup.commands.report import report
 from pipeprog_bringup.commands.score import score
@@ -41,7 +42,7 @@ app = typer.Typer(
 )
 for panel, commands in {
     "From recordings": (check, replay, fleet, detect),
-    "On a robot": (patrol, simulate_patrol),
+    "On a robot": (patrol, simulate_patrol, policy),
     "To recordings": (ingest, board, calibrate),
     "From results": (score, report, compare, view, export),
 }.items():
