@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,13 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
 from std_srvs.srv import Trigger
 
+from pipeprog_bringup.access_policy import GraphNames, policy_xml
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import FrameDecision, SiteProgress
 from pipeprog_node import messages, qos
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
+from tests.access import Access, allowed, used
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG, BOQ, BOARD = (BAGS / f"demo.{end}" for end in ("mcap", "boq.yaml", "board.yaml"))
@@ -42,6 +44,7 @@ PERIOD = 0.1  # s between two images
 MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"} | {
     "survey": "pipeprog_bringup.survey.node"
 }
+ROLLING_SHUTTER_ALONE = ("/pipeprog/sfm", "/sfm", "publish", "/keyframe_velocities")
 REPLAYED = {"cloud.las", "cloud.ply", "config.yaml", "frames.csv", "out.mcap", "pipes.json", "progress.csv", "run.json"}
 REPLAYED |= {"map.npz", "trajectory.tum", "colmap/cameras.txt", "colmap/images.txt", "colmap/points3D.txt"}
 
@@ -49,8 +52,8 @@ REPLAYED |= {"map.npz", "trajectory.tum", "colmap/cameras.txt", "colmap/images.t
 class Mission:
     """A robot whose camera never rests, and the client of its surveys."""
 
-    def __init__(self) -> None:
-        self.node = Node("mission")
+    def __init__(self, namespace: str) -> None:
+        self.node = Node("mission", namespace=namespace)
         self.feedback: list[Survey.Feedback] = []
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
@@ -138,9 +141,10 @@ class Mission:
 
 
 @pytest.fixture
-def mission() -> Iterator[Mission]:
+def mission(request: pytest.FixtureRequest) -> Iterator[Mission]:
+    """In the root, or in the namespace that a test asks for."""
     rclpy.init()
-    mission = Mission()
+    mission = Mission(getattr(request, "param", ""))
     yield mission
     mission.client.destroy()
     mission.node.destroy_node()
@@ -154,6 +158,14 @@ class Nodes:
         self.folder = folder
         self._commands: dict[str, list[str]] = {}
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start_all(self, parameters: dict[str, dict[str, Any]], arguments: Sequence[str] = ()) -> None:
+        """Each node in an enclave of its own, with `arguments` of ROS for all of them."""
+        for name, module in MODULES.items():
+            file = self.folder.parent / f"{name}.yaml"
+            file.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": parameters[name]}}))
+            words = ["-r", f"__node:={name}", "--params-file", str(file), "--enclave", f"/pipeprog/{name}", *arguments]
+            self.start(name, [sys.executable, "-m", module, "--ros-args", *words])
 
     def start(self, name: str, command: list[str]) -> None:
         self._commands[name] = command
@@ -172,25 +184,35 @@ class Nodes:
 
 
 @pytest.fixture
-def nodes(tmp_path: Path) -> Iterator[Nodes]:
-    parameters: dict[str, dict[str, Any]] = {
-        "frames": {"idle": True},
-        "sfm": {"map_interval": 4, **COARSE},
-        "detect": {"boq": str(BOQ)},
-        "survey": {"boq": str(BOQ), "board": str(BOARD), "results": str(tmp_path / "surveys")},
-    }
+def robot(tmp_path: Path) -> Iterator[Nodes]:
+    """A graph of which no node runs yet."""
     nodes = Nodes(tmp_path / "surveys")
-    for name, module in MODULES.items():
-        file = tmp_path / f"{name}.yaml"
-        file.write_text(yaml.safe_dump({name: {"ros__parameters": parameters[name]}}))
-        command = [sys.executable, "-m", module, "--ros-args", "-r", f"__node:={name}", "--params-file", str(file)]
-        nodes.start(name, command)
     yield nodes
     nodes.close()
 
 
+@pytest.fixture
+def nodes(robot: Nodes) -> Nodes:
+    robot.start_all(
+        {
+            "frames": {"idle": True, "image_transport": "compressed"},
+            "sfm": {"map_interval": 4, **COARSE},
+            "detect": {"boq": str(BOQ)},
+            "survey": {"boq": str(BOQ), "board": str(BOARD), "results": str(robot.folder)},
+        }
+    )
+    return robot
+
+
 def names(folder: Path) -> set[str]:
     return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
+
+
+def unlike_the_policy(mission: Mission, names: GraphNames) -> tuple[set[Access], set[Access]]:
+    """What the nodes use and the policy does not allow, and what it allows that they do not use."""
+    may = allowed(policy_xml(names))
+    do = used(mission.node, {enclave for enclave, *_ in may})
+    return do - may, may - do
 
 
 def test_surveys_come_one_after_another(mission: Mission, nodes: Nodes) -> None:
@@ -211,6 +233,7 @@ def test_surveys_come_one_after_another(mission: Mission, nodes: Nodes) -> None:
     assert not mission.send().accepted  # one at a time
     mission.wait_for(lambda: mission.feedback and mission.feedback[-1].classes)  # the robot stands, pipes are there
     assert mission.feedback[-1].metric
+    assert unlike_the_policy(mission, GraphNames()) == (set(), {ROLLING_SHUTTER_ALONE})
     assert mission.call(mission.end, Trigger.Request()).success
     first = mission.result(handle)
     assert (first.status, first.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")
@@ -277,3 +300,37 @@ def test_a_survey_goes_on_where_its_own_node_was_killed(mission: Mission, nodes:
     nodes.kill_and_start_again("survey", signal.SIGINT)
     mission.meet()
     assert not mission.send().accepted  # who stops a node does not want it to be active again
+
+
+@pytest.mark.parametrize("mission", ["robot7"], indirect=True)
+def test_a_policy_allows_what_the_nodes_of_a_robot_with_two_cameras_use(mission: Mission, robot: Nodes) -> None:
+    names = GraphNames(
+        namespace="robot7",
+        cameras=("/spot/camera/left", "right"),
+        odometry="/spot/odometry",
+        imu="body/imu",
+        image_transport="raw",
+        use_sim_time=True,
+        record=True,
+        publish_tf=True,
+    )
+    cameras = " ".join(names.cameras)
+    robot.start_all(
+        {
+            "frames": {"idle": True, "cameras": cameras, "image_transport": names.image_transport},
+            "sfm": {"publish_tf": names.publish_tf},
+            "detect": {"boq": str(BOQ)},
+            "survey": {"boq": str(BOQ), "results": str(robot.folder), "record": names.record, "cameras": cameras},
+        },
+        arguments=(
+            *("-r", f"__ns:=/{names.namespace}", "-p", f"use_sim_time:={names.use_sim_time}"),
+            *("-r", f"odometry:={names.odometry}", "-r", f"imu:={names.imu}"),
+        ),
+    )
+    mission.meet()
+    assert mission.change(Transition.TRANSITION_CONFIGURE)
+    assert mission.change(Transition.TRANSITION_ACTIVATE)
+    assert mission.send(survey_id="rig").accepted
+    mission.wait_for(lambda: mission.feedback and mission.feedback[-1].state == Survey.Feedback.FILMING)
+    velocities = ("/pipeprog/sfm", "/robot7/sfm", "publish", "/robot7/keyframe_velocities")
+    assert unlike_the_policy(mission, names) == (set(), {velocities})
