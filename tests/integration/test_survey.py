@@ -24,7 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from pipeprog_bringup.access_policy import GraphNames, policy_xml
 from pipeprog_bringup.recording.bag import Bag
@@ -63,12 +63,14 @@ class Mission:
         self._stamps = itertools.count(1_700_000_000_000_000_000, 200_000_000)
         self._place = 0  # number of the frame that the camera shows
         self._shown = self._decided = 0  # stamps of the first image of that frame, and of the last decision
+        self.filmed = 0  # images
         self.node.create_subscription(FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
         self.node.create_timer(PERIOD, self._film)
         self.progress: list[SiteProgress] = []
         self.node.create_subscription(SiteProgress, "progress", self.progress.append, qos.latched())
         self.state = self.node.create_client(ChangeState, "survey/change_state")
         self.end = self.node.create_client(Trigger, "survey/end")
+        self.pause = self.node.create_client(SetBool, "survey/pause")
         self.client = ActionClient(self.node, Survey, "survey")  # the last one that the other nodes find
 
     def wait_for(self, condition: Callable[[], object], seconds: float = TIMEOUT) -> None:
@@ -118,6 +120,17 @@ class Mission:
                 return future.result()
         raise AssertionError("no such answer")
 
+    def film_on(self) -> None:
+        """Waits while the camera sends twenty images."""
+        filmed = self.filmed
+        self.wait_for(lambda: self.filmed > filmed + 20)
+
+    def hears(self, is_wanted: Callable[[Survey.Feedback], object]) -> Survey.Feedback:
+        """Waits for feedback that is wanted, of those that come from now on."""
+        self.feedback.clear()
+        self.wait_for(lambda: self.feedback and is_wanted(self.feedback[-1]))
+        return self.feedback[-1]
+
     def result(self, handle: Any) -> Any:
         future = handle.get_result_async()
         self.wait_for(future.done)
@@ -135,6 +148,7 @@ class Mission:
         info.header = image.header = messages.header(stamp, frame.frame_id)
         self._infos.publish(info)
         self._images.publish(image)
+        self.filmed += 1
 
     def _on_decision(self, message: FrameDecision) -> None:
         self._decided = max(self._decided, messages.stamp_ns(message.header.stamp))
@@ -280,10 +294,18 @@ def test_a_survey_goes_on_where_its_own_node_was_killed(mission: Mission, nodes:
     assert mission.change(Transition.TRANSITION_ACTIVATE)
     assert mission.send(survey_id="killed").accepted
     mission.wait_for(lambda: mission.feedback and mission.feedback[-1].registered > 2)
-    frames, keyframes = mission.feedback[-1].frames, mission.feedback[-1].keyframes
+    assert mission.call(mission.pause, SetBool.Request(data=True)).success
+    mission.film_on()
+    paused = mission.hears(lambda told: "survey/pause" in told.advice)
+    frames, keyframes = paused.frames, paused.keyframes
     nodes.kill_and_start_again("survey")
     handle = mission.send_again(survey_id="killed")  # nobody has configured it
-    mission.wait_for(lambda: any(told.classes and told.frames > frames for told in mission.feedback))
+    mission.film_on()
+    paused = mission.hears(lambda told: "survey/pause" in told.advice)  # as before
+    assert paused.frames == frames
+    assert mission.call(mission.pause, SetBool.Request(data=False)).success
+    told = mission.hears(lambda told: told.classes and told.frames > frames)
+    assert "survey/pause" not in told.advice
     assert mission.call(mission.end, Trigger.Request()).success
     answer = mission.result(handle)
     assert (answer.status, answer.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")

@@ -115,7 +115,7 @@ def profiles(names: GraphNames) -> dict[str, list[Profile]]:
         "frames": _stage(
             "frames",
             publish=("frame_decisions", *keyframes),
-            subscribe=(*_camera_topics(names, raw=is_raw, compressed=not is_raw), "image_overlap", *clock),
+            subscribe=(*_camera_topics(names, raw=is_raw, compressed=not is_raw), "image_overlap", "survey/paused", *clock),
         ),
         "sfm": _stage(
             "sfm",
@@ -174,9 +174,9 @@ def _survey(names: GraphNames, clock: tuple[str, ...]) -> Profile:
     recorded = (*_camera_topics(names), names.odometry, names.imu, *_TRANSFORMS) if names.record else ()
     return Profile(
         "survey",
-        publish=("/rosout", _EVENTS, "progress", "~/transition_event"),
+        publish=("/rosout", _EVENTS, "progress", "~/paused", "~/transition_event"),
         subscribe=(*recorded, *clock),
-        reply=("~/end", _TYPES, *_own(_PARAMETERS), *_own(_LIFECYCLE)),
+        reply=("~/end", "~/pause", _TYPES, *_own(_PARAMETERS), *_own(_LIFECYCLE)),
         execute=("survey",),
     )
 

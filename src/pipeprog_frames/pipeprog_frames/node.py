@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Bool
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
@@ -178,7 +179,8 @@ class FramesNode(Node):
         self._ledger = Ledger(exact=self._config.lockstep)
         self._considered = self._dropped = 0
         self._faults: Counter[str] = Counter()  # images refused, by the beginning of the reason
-        self._flushed = self._is_over = False
+        self._flushed = self._is_over = self._is_paused = False
+        self._passed_over = 0  # images that came while the survey was paused
         self._frame_id = ""  # of the camera, as its last image says
 
         self._publisher = KeyframePublisher(self)
@@ -198,6 +200,8 @@ class FramesNode(Node):
         self._overlaps = subscribe(ImageOverlapArray, "image_overlap", _answer, self._on_answer, profile)
         if self._config.lockstep:
             self._connecting = self.create_timer(0.1, self._start_when_connected)
+        else:  # a state and no call: a node that is started anew in a pause hears of it, too
+            subscribe(Bool, "survey/paused", lambda message: bool(message.data), self._on_paused, qos.latched())
         self._finish = FinishService(self, lambda: self._considered + len(self._queue), self._on_finish)
         self._diagnostics = Diagnostics(self, "keyframes", self._health)
 
@@ -230,6 +234,9 @@ class FramesNode(Node):
     def _on_image(self, arrival: Arrival) -> None:
         if self._finish.is_due or self._is_over:
             return  # the survey ended with the images before: a camera goes on for ever
+        if self._is_paused:
+            self._passed_over += 1
+            return
         dropped = self._queue.push(arrival)
         self._dropped += len(dropped)
         uncalibrated = self._selection.uncalibrated
@@ -243,6 +250,13 @@ class FramesNode(Node):
             self.get_logger().warning(
                 f"images without CameraInfo: publish the calibration on {topic}", throttle_duration_sec=10.0
             )
+
+    def _on_paused(self, is_paused: bool) -> None:
+        """Takes no images during a pause; the first one after it may show another place."""
+        if is_paused != self._is_paused:
+            self._is_paused = is_paused
+            self._decide(self._selection.begin_anew())
+            self._drain()
 
     def _start_when_connected(self) -> None:
         if self._is_connected():
@@ -366,9 +380,12 @@ class FramesNode(Node):
             "damaged": self._faults[DAMAGED],
             "dropped": self._dropped,
             "queued": len(self._queue),
+            "passed over while the survey was paused": self._passed_over,
             **{f"frames refused: {fault}": count for fault, count in sorted(self._faults.items())},
             **self._input.intake.health(),
         }
+        if self._is_paused:
+            return DiagnosticStatus.OK, "the survey is paused: images are passed over", values
         if uncalibrated := self._selection.uncalibrated:
             of = f" of {', '.join(uncalibrated)}" if any(uncalibrated) else ""
             return DiagnosticStatus.WARN, f"no usable CameraInfo yet{of}", values

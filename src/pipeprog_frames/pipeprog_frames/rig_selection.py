@@ -65,6 +65,10 @@ class RigSelection:
             self._frames[arrival.camera] = arrival.frame_id
         return self._named(arrival.camera, self._of[arrival.camera].consider(arrival))
 
+    def begin_anew(self) -> Selected:
+        """Decides on the images that are still undecided; the next ones have no connection with those before them."""
+        return [each for name, selection in self._of.items() for each in self._named(name, selection.begin_anew())]
+
     def flush(self) -> Selected:
         """Decides on the images that are still undecided."""
         return [each for name, selection in self._of.items() for each in self._named(name, selection.flush())]

@@ -46,10 +46,16 @@ class Selection:
             return [(Decision(arrival.stamp, False, arrival.refusal), None)]
         placed = self._order.place(arrival.stamp, arrival)
         selected = _refused(placed.refused)
-        if placed.anew and self._policy is not None and self._camera is not None:
-            selected += self._selected(self._policy.begin_anew(self._camera))
+        if placed.anew:
+            selected += self.begin_anew()
             self._store.forget_from(placed.taken[0].stamp)
         return selected + [each for taken in placed.taken for each in self._show(taken)]
+
+    def begin_anew(self) -> Selected:
+        """Decides on the images that are still undecided; the next one has no connection with those before it."""
+        if self._policy is None or self._camera is None:
+            return []
+        return self._selected(self._policy.begin_anew(self._camera))
 
     def flush(self) -> Selected:
         """Decides on the images that are still undecided."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Bool
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
@@ -31,6 +32,7 @@ from tests.fuzz.fuzzed_messages import png_header
 
 CAMERA = Camera(640, 360, 450.0, 450.0, 319.5, 179.5)
 START = 1_700_000_000_000_000_000
+PASSED_OVER = "passed over while the survey was paused"
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +109,12 @@ class Stage:
         self._images.publish(image)
         self.spin_until(lambda: self._counted("frames considered") > considered)
         self.spin_until(lambda: len(self.keyframes) == self._counted("keyframes"))
+
+    def pass_over(self, image: CompressedImage) -> None:
+        """One image that comes in a pause."""
+        passed_over = self._counted(PASSED_OVER)
+        self._images.publish(image)
+        self.spin_until(lambda: self._counted(PASSED_OVER) > passed_over)
 
     def has_considered(self, more_than: int) -> bool:
         return self._counted("frames considered") > more_than
@@ -413,6 +421,33 @@ def test_in_lockstep_every_image_is_decided_on(stage: Callable[..., Stage], wall
         *("size differs from CameraInfo", "damaged image"),
     ]
     assert "300 characters" in said[sent[15]]
+
+
+def test_in_a_pause_images_are_passed_over_and_a_new_track_begins_afterwards(
+    stage: Callable[..., Stage], wall: NDArray
+) -> None:
+    scene = stage()
+    paused = scene.others.create_publisher(Bool, "survey/paused", qos.latched())
+    for index in range(7):
+        stamp = START + index * 200_000_000
+        scene.show(stamp, compressed(stamp, view(wall, 30 * index)))
+    paused.publish(Bool(data=True))
+    scene.spin_until(lambda: scene.node._health()[1] == "the survey is paused: images are passed over")
+    scene.spin_until(lambda: len(scene.decisions) == 7)  # none waits for what comes after the pause
+    for index in range(7, 10):
+        scene.pass_over(compressed(START + index * 200_000_000, view(wall, 30 * index)))
+    assert scene._counted("frames considered") == 7
+    assert scene._counted(PASSED_OVER) == 3
+    paused.publish(Bool(data=False))
+    scene.spin_until(lambda: scene.node._health()[1] == "selecting")
+    shown = [START + (50 + index) * 200_000_000 for index in range(6)]
+    for index, stamp in enumerate(shown):
+        scene.show(stamp, compressed(stamp, view(wall, 4000 + 80 * index)))
+    scene.spin_until(lambda: len(scene.decisions) >= 8)
+    said = {messages.stamp_ns(decision.header.stamp): decision.reason for decision in scene.decisions}
+    assert said[shown[0]] == "first frame"
+    assert len(set(scene.chosen()) & set(shown)) >= 4
+    assert not scene.retired
 
 
 def test_a_survey_without_a_keyframe_ends_with_a_remedy(stage: Callable[..., Stage]) -> None:

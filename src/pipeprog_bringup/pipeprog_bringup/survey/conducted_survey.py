@@ -32,6 +32,7 @@ from pipeprog_node import messages, qos
 from pipeprog_node.keyframe_input import CALIBRATIONS, DEPTH, IMAGES
 
 FEEDBACK_PERIOD = 0.5  # s
+PAUSED = "the survey is paused and takes no images: to go on, call the service survey/pause with data: false"
 ROOM_PERIOD = 1.0  # s between two looks at the disk
 # Shares of the work after filming that are done when a stage begins; measured on a lab: reconstruction 60 %.
 _SHARE_BEFORE = {Survey.Feedback.RECONSTRUCTING: 0.0, Survey.Feedback.MEASURING: 0.6, Survey.Feedback.WRITING: 0.9}
@@ -87,7 +88,7 @@ class ConductedSurvey:
                     progress.is_filmed
                     or self._is_end_asked()
                     or self._is_full
-                    or time.monotonic() - progress.filming > limit
+                    or progress.filmed(time.monotonic()) > limit
                 )
             )
             progress.is_filmed = True
@@ -104,9 +105,28 @@ class ConductedSurvey:
         await self._at_rest()
         return result
 
+    def pause(self, is_paused: bool) -> str:
+        """Has no images taken until it goes on, in the same map; returns why that cannot be, empty: it is done."""
+        progress = self._journal.progress
+        if progress.is_filmed or self._stopped:
+            return "filming is over: the survey is worked off"
+        (progress.pause if is_paused else progress.go_on)(time.monotonic())
+        self._journal.note()
+        self._tell_pause()
+        return ""
+
+    @property
+    def _is_paused(self) -> bool:
+        return self._journal.progress.is_paused and not self._stopped
+
+    def _tell_pause(self) -> None:
+        self._passage.pause(self._is_paused)
+        self._output.is_paused = self._is_paused
+
     async def _begin(self) -> None:
         """Lets the nodes begin, or goes on where they have."""
         passage, progress = self._passage, self._journal.progress
+        self._tell_pause()
         if progress.begun:
             await passage.go_on(progress.begun)
             return
@@ -174,7 +194,7 @@ class ConductedSurvey:
     def _look_for_input(self, now: float) -> None:
         """Says why no images come, once they have not for a while."""
         passage = self._passage
-        is_filming = passage.stage == Survey.Feedback.FILMING
+        is_filming = passage.stage == Survey.Feedback.FILMING and not self._is_paused
         if not is_filming or passage.log.considered > self._considered or self._decided > now:
             self._considered, self._decided, self._missing = passage.log.considered, now, ""
         elif now - self._decided > PATIENCE:
@@ -200,7 +220,7 @@ class ConductedSurvey:
             tracking=log.is_tracking,
             last_known=maps.poses.poses[-1] if maps.poses is not None and maps.poses.poses else PoseStamped(),
             metric=status.metric,
-            advice=self._missing or status.message,
+            advice=PAUSED if self._is_paused else (self._missing or status.message),
             classes=[] if maps.newest is None else maps.newest.pipes.classes,
             progress=self._progress(),
             elapsed=messages.duration_msg(elapsed),

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from pipeprog_bringup.survey.conducted_survey import ConductedSurvey
 from pipeprog_bringup.survey.goal import check_goal, read_reference, read_site
@@ -53,6 +53,7 @@ class SurveyNode(LifecycleNode):
         self._record = declare_fixed(self, "record", False, "keep the images of each survey as recording.mcap")
         self._cameras = declare_fixed(self, "cameras", "", "of a rig, as of frames: whose images are kept").split()
         self._running: Client | None = None
+        self._survey: ConductedSurvey | None = None
         self._left = unfinished(self._results)
         self._takeover = Takeover(self._results, self.get_fully_qualified_name())
         self._is_active = self._end_asked = False
@@ -70,6 +71,7 @@ class SurveyNode(LifecycleNode):
         )
         self._progress = self.create_publisher(SiteProgress, "progress", qos.latched())
         self._end = self.create_service(Trigger, "~/end", self._on_end, callback_group=group)
+        self._pause = self.create_service(SetBool, "~/pause", self._on_pause, callback_group=group)
         # Steady time: a paused recording stops ROS time.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(TICK, self._wake, callback_group=group, clock=steady)
@@ -131,6 +133,12 @@ class SurveyNode(LifecycleNode):
         self._end_asked = response.success
         return response
 
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        problem = self._survey.pause(request.data) if self._survey is not None else "no survey is running"
+        response.success = not problem
+        response.message = problem or ("the survey is paused" if request.data else "the survey goes on")
+        return response
+
     async def _execute(self, handle: ServerGoalHandle) -> Survey.Result:
         request: Survey.Goal = handle.request
         client = self._running
@@ -183,11 +191,12 @@ class SurveyNode(LifecycleNode):
         robot = RobotInput(self, output, self._cameras) if self._record else None
         try:
             ended, lack = (lambda: self._end_asked), (lambda: missing_input(self, self._cameras))
-            survey = ConductedSurvey(
+            self._survey = ConductedSurvey(
                 listener, client, goal, output, journal, self._tick, ended, lack, self._takeover.keep
             )
-            result = await survey.run()
+            result = await self._survey.run()
         finally:
+            self._survey = None
             journal.close()
             if robot is not None:
                 robot.close()

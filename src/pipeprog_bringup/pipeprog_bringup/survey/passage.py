@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
+from std_msgs.msg import Bool
 
 from pipeprog_bringup.playback.connections import missing_connections
 from pipeprog_bringup.playback.frame_log import LiveFrameLog
@@ -27,6 +28,7 @@ from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import UNCALIBRATED
 from pipeprog_msgs import srv
 from pipeprog_msgs.action import Survey
+from pipeprog_node import qos
 from pipeprog_node.settings import build, describe
 from pipeprog_sfm.config import SfmConfig
 
@@ -77,6 +79,7 @@ class Passage:
         self.stage = Survey.Feedback.STARTING
         self._finish = {name: node.create_client(srv.Finish, f"{name}/finish") for name in CONFIGS}
         self._renew = {name: node.create_client(srv.Renew, f"{name}/renew") for name in CONFIGS}
+        self._paused = node.create_publisher(Bool, "survey/paused", qos.latched())
         self._begun: dict[str, dict[str, Any]] = {}  # how each node has begun this survey: fields of Renew
         space = node.get_namespace().strip("/")
         self._names = {f"{space}/{name}".strip("/"): name for name in CONFIGS}  # by how diagnostics call them
@@ -108,6 +111,10 @@ class Passage:
         """Takes a survey up whose node `survey` was killed, while the others went on."""
         self._begun = begun
         await self._until(self._is_connected, DELIVERY_SECONDS, "the nodes have not found each other")
+
+    def pause(self, is_paused: bool) -> None:
+        """Has `frames` take no images, or take them again; one that is started anew later hears of it, too."""
+        self._paused.publish(Bool(data=is_paused))
 
     async def film(self, is_over: Callable[[], bool]) -> None:
         """Lets images come until `is_over`."""
@@ -141,6 +148,7 @@ class Passage:
         """Lets the nodes forget this survey and take no images."""
         self._begun.clear()
         await self._renewed("frames", idle=True)
+        self.pause(False)
         await self._renewed("sfm")
         await self._renewed("detect")
 

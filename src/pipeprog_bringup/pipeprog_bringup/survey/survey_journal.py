@@ -25,7 +25,8 @@ class Progress:
     Attributes:
         goal: the action's goal, in CDR.
         begun: how each of the other nodes has begun it; empty: not all have.
-        filming: when filming began, of the clock `time.monotonic`; 0: not yet.
+        filming: when filming began, of the clock `time.monotonic`, later by the pauses that are over; 0: not yet.
+        paused: when the pause that lasts began, of that clock; 0: there is none.
         is_filmed: whether filming has ended.
     """
 
@@ -33,6 +34,26 @@ class Progress:
     begun: dict[str, dict[str, Any]] = field(default_factory=dict)
     filming: float = 0.0
     is_filmed: bool = False
+    paused: float = 0.0
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether no images are taken, and will be again."""
+        return self.paused > 0.0 and not self.is_filmed
+
+    def filmed(self, now: float) -> float:
+        """How long it has been filmed until the time `now` of `time.monotonic`, without pauses; s."""
+        return (self.paused or now) - self.filming
+
+    def pause(self, now: float) -> None:
+        """Begins a pause, where there is none."""
+        self.paused = self.paused or now
+
+    def go_on(self, now: float) -> None:
+        """Ends the pause, if there is one."""
+        if self.paused and self.filming:
+            self.filming += now - max(self.paused, self.filming)
+        self.paused = 0.0
 
 
 class SurveyJournal:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import CameraInfo, CompressedImage
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from pipeprog_bringup.playback.frame_log import FrameLog
 from pipeprog_bringup.playback.listener import LastMessages
@@ -43,6 +43,7 @@ class SurveyOutput:
     Attributes:
         path: the folder.
         journal: folder for what the nodes write down for the case that they are killed; it ends with the survey.
+        is_paused: whether images of the robot are left out of recording.mcap.
     """
 
     def __init__(self, results: Path, goal: Goal, record: bool, left: Path | None = None) -> None:
@@ -68,6 +69,7 @@ class SurveyOutput:
         self.journal = self._folder.file(JOURNAL)
         self.journal.mkdir(exist_ok=True)
         self._is_taken_up = left is not None
+        self.is_paused = False
 
     @property
     def colmap(self) -> Path:
@@ -101,7 +103,7 @@ class SurveyOutput:
 
     def keep_input(self, topic: str, kind: type, data: bytes, stamp: int) -> None:
         """Writes a message of the robot into recording.mcap, if the input is recorded; `stamp` [ns]: when it came."""
-        if self._input is not None:
+        if self._input is not None and not (self.is_paused and kind in (CompressedImage, Image)):
             self._input.write(topic, type_name(kind), data, stamp)
 
     def write(

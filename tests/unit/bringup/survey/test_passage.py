@@ -16,6 +16,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
+from std_msgs.msg import Bool
 
 from pipeprog_bringup.playback.frame_log import LiveFrameLog
 from pipeprog_bringup.survey import passage as passages
@@ -23,6 +24,7 @@ from pipeprog_bringup.survey.goal import Goal, read_site
 from pipeprog_bringup.survey.passage import CONFIGS, MAX_RESTARTS, Passage, SurveyFailure
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.srv import Finish, Renew
+from pipeprog_node import qos
 from pipeprog_node.diagnostics import PROCESS
 
 BAGS = Path(__file__).parents[4] / "bags"
@@ -96,10 +98,7 @@ class Stage:
 
     def run(self, coroutine: Any) -> Any:
         task = self._executor.create_task(coroutine)
-        deadline = time.monotonic() + TIMEOUT
-        while not task.done():
-            assert time.monotonic() < deadline, "waited in vain"
-            self._executor.spin_once(timeout_sec=TICK)
+        self.spin_until(task.done)
         if task.exception() is not None:
             raise task.exception()
         return task.result()
@@ -108,6 +107,12 @@ class Stage:
         site = read_site(str(BAGS / "demo.boq.yaml"), "")
         self.run(self.passage.begin(Goal("survey", site, 0.0), folder / "colmap", folder / "journal"))
         self.graph.asked.clear()
+
+    def spin_until(self, condition: Callable[[], object]) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while not condition():
+            assert time.monotonic() < deadline, "waited in vain"
+            self._executor.spin_once(timeout_sec=TICK)
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -176,3 +181,14 @@ def test_a_node_that_dies_again_and_again_ends_the_survey(stage: Stage, tmp_path
     with pytest.raises(SurveyFailure, match=f"died {MAX_RESTARTS + 1} times, the last was frames") as failure:
         stage.run(stage.passage.work_off())
     assert failure.value.code == Survey.Result.PROCESS_DIED
+
+
+def test_a_node_that_is_started_anew_hears_of_the_pause(stage: Stage, tmp_path: Path) -> None:
+    stage.begin(tmp_path)
+    stage.passage.pause(True)
+    heard: list[bool] = []
+    late = stage.graph.node
+    late.create_subscription(Bool, "survey/paused", lambda message: heard.append(message.data), qos.latched())
+    stage.spin_until(lambda: heard == [True])
+    stage.run(stage.passage.rest())
+    stage.spin_until(lambda: heard == [True, False])
