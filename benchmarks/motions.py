@@ -28,6 +28,7 @@ from pipeprog_frames.frame_decision import Decision
 from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile
 from pipeprog_frames.overlap_feedback import OverlapReport
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.policy.stream import KeyframeStream
 from pipeprog_sfm.config import SfmConfig
 from pipeprog_sfm.sparse.mapper import Mapper
@@ -151,7 +152,7 @@ def survive(frames: Recorded) -> dict[str, Any]:
 def mapped(frames: Recorded, camera: Camera) -> tuple[list[int], Mapper]:
     """Stamps of the keyframes of a recording and the mapper that has worked them off, in lockstep with the selector."""
     ring, mapper, images = FrameFile(), Mapper(SfmConfig().mapper), dict(frames)
-    stream = KeyframeStream(FramesConfig(), camera, ring.sharpest_between)
+    stream = KeyframeStream(FramesConfig(), camera, ring.sharpest_between, KeyframeBudget(0))
     changes: deque[Decision] = deque()
     keyframes: set[int] = set()
 

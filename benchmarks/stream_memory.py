@@ -26,6 +26,7 @@ from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameRing
 from pipeprog_frames.overlap_feedback import OverlapReport
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.policy.stream import KeyframeStream
 
 RESULTS = Path(__file__).parent / "results"
@@ -53,7 +54,7 @@ def main() -> None:
     command = f"python -m benchmarks.stream_memory {arguments.recording} --minutes {arguments.minutes}"
     config = FramesConfig()
     ring = FrameRing(config.buffer_mib << 20)
-    stream = KeyframeStream(config, camera, ring.sharpest_between)
+    stream = KeyframeStream(config, camera, ring.sharpest_between, KeyframeBudget(0))
     before, started = _resident_mib(), time.process_time()
     rows: list[dict[str, float | int]] = []
     chosen = 0

@@ -40,6 +40,13 @@ class FramesConfig:
         "MiB",
         (8, 4096),
     )
+    max_keyframes: int = setting(
+        0,
+        "keyframes that a map may hold at once, each of which takes memory; from half of them on fewer are chosen, and "
+        "none once the map holds as many; 0: any number (policy stream alone)",
+        "keyframes",
+        (0, 1_000_000),
+    )
     lockstep: bool = setting(
         False, "wait for the SfM after each keyframe: the same recording then gives the same result every time"
     )

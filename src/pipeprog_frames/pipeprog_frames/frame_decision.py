@@ -14,13 +14,15 @@ DAMAGED = "damaged image"
 UNCALIBRATED = "calibration: no usable CameraInfo has come"
 FOREIGN = "calibration: the camera is none of the rig's"
 OTHER_SIZE = "size differs from CameraInfo"
+FULL = "max_keyframes reached: the map holds as many keyframes as it may"
 FAULTS = (
     "damaged",
     "stamp",
     "size",
     "calibration",
     "video",
-)  # beginnings of reasons that are faults of the images themselves
+    "max_keyframes",
+)  # beginnings of reasons that are faults of the images themselves, or of a limit: their frames are lost to the map
 UNMATCHED = "shows nothing of the frames before and after it"
 JUMP = "shows nothing of the frames before it"
 

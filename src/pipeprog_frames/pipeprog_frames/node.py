@@ -27,6 +27,7 @@ from pipeprog_frames.incoming.arrival import MAX_QUEUE, Arrival, ArrivalQueue
 from pipeprog_frames.incoming.decoding import decode_reduced, reduce_image
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame
 from pipeprog_frames.overlap_feedback import OverlapReport
+from pipeprog_frames.policy.stream import UNLOADED_LAG
 from pipeprog_frames.rig_selection import ONE, RigSelection
 from pipeprog_frames.selection import Selected
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
@@ -215,6 +216,7 @@ class FramesNode(Node):
         """Counts what is in the journal as published, and publishes the last of it again: it may not have arrived."""
         for number, change in journal.commands():
             self._publish(change, again=number >= journal.end - KEPT)
+            self._selection.budget.held += 1 if isinstance(change, EncodedFrame) else -len(change)
 
     def _publish(self, change: EncodedFrame | list[int], again: bool = True) -> None:
         """Publishes a keyframe or a retirement; without `again` it is counted only."""
@@ -376,6 +378,7 @@ class FramesNode(Node):
         values = {
             "frames considered": self._considered,
             "keyframes": len(self._ledger.published),
+            "keyframes in the map": self._selection.budget.held,
             "keyframes that the SfM is behind": self._ledger.lag,
             "damaged": self._faults[DAMAGED],
             "dropped": self._dropped,
@@ -389,9 +392,14 @@ class FramesNode(Node):
         if uncalibrated := self._selection.uncalibrated:
             of = f" of {', '.join(uncalibrated)}" if any(uncalibrated) else ""
             return DiagnosticStatus.WARN, f"no usable CameraInfo yet{of}", values
+        if self._selection.budget.is_full:
+            most = self._config.max_keyframes
+            return DiagnosticStatus.WARN, f"max_keyframes = {most} is reached: no further ones are chosen", values
         if self._selection.overlap_min < self._config.overlap_min:
             fewer = f"fewer keyframes, at an overlap of {self._selection.overlap_min:.2f}"
-            return DiagnosticStatus.WARN, f"the SfM cannot keep up: {fewer}", values
+            lags = self._ledger.lag > UNLOADED_LAG
+            why = "the SfM cannot keep up" if lags else "max_keyframes is near"
+            return DiagnosticStatus.WARN, f"{why}: {fewer}", values
         if self._dropped:
             return DiagnosticStatus.WARN, "frames were dropped: the machine cannot keep up", values
         if self._input.intake.lost:

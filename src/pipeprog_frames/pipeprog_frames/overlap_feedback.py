@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from pipeprog_frames.frame_decision import Decision
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 
 MIN_GAIN = 0.01  # of overlap, by an added frame; with less, the next frame would not help either
 MAX_BRIDGES = 3  # frames added on each side of an unregistered image: the third is at an eighth of the gap
@@ -63,6 +64,8 @@ class StreamFeedback:
     decisions that are noted). One is retired, too, where keyframes of earlier visits show the same by more than
     `overlap_max`: what is kept grows with the site, not with the time spent there.
 
+    No frame is added while the `budget`, which counts the keyframes so far, is full.
+
     This terminates: a frame that was added is never thinned out, and a retired one is never added again.
 
     Attributes:
@@ -70,9 +73,16 @@ class StreamFeedback:
             neighbours are, or for an earlier visit; None: no matter how far.
     """
 
-    def __init__(self, overlap_min: float, overlap_max: float, parallax_max: float, best_between: BestBetween) -> None:
+    def __init__(
+        self,
+        overlap_min: float,
+        overlap_max: float,
+        parallax_max: float,
+        best_between: BestBetween,
+        budget: KeyframeBudget,
+    ) -> None:
         self._overlap_min, self._overlap_max, self._parallax_max = overlap_min, overlap_max, parallax_max
-        self._best_between = best_between
+        self._best_between, self._budget = best_between, budget
         self._stamps: list[int] = []
         self._keyframes: dict[int, _Keyframe] = {}
         self._retired: set[int] = set()
@@ -104,6 +114,7 @@ class StreamFeedback:
         if keyframe.stamp not in self._keyframes:
             insort(self._stamps, keyframe.stamp)
             self._keyframes[keyframe.stamp] = keyframe
+            self._budget.held += 1
 
     def _neighbours(self, stamp: int) -> tuple[int | None, int | None]:
         index = bisect_left(self._stamps, stamp)
@@ -120,6 +131,8 @@ class StreamFeedback:
         return all(self._keyframes[other].report is not None for other in around)
 
     def _add_beside(self, stamp: int) -> list[Decision]:
+        if self._budget.is_full:  # it is judged again once there is room
+            return []
         keyframe = self._keyframes[stamp]
         report = keyframe.report
         assert report is not None
@@ -145,7 +158,7 @@ class StreamFeedback:
         return []
 
     def _fill(self, first: int | None, second: int | None, reason: str) -> list[Decision]:
-        if first is None or second is None:
+        if first is None or second is None or self._budget.is_full:
             return []
         stamp = self._best_between(first, second, self._retired)
         if stamp is None:
@@ -215,4 +228,5 @@ class StreamFeedback:
         keyframe = self._keyframes.pop(stamp)
         self._stamps.remove(stamp)
         self._retired.add(stamp)
+        self._budget.held -= 1
         return Decision(stamp, False, reason, keyframe.overlap)

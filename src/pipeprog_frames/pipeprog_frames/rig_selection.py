@@ -13,6 +13,7 @@ from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import FOREIGN, Decision
 from pipeprog_frames.incoming.arrival import Arrival
 from pipeprog_frames.overlap_feedback import OverlapReport
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.selection import Selected, Selection
 
 ONE = ""  # the name of a camera that is no rig's
@@ -22,8 +23,12 @@ _MIN_MIB = 8  # of memory for a camera's frames, as for `buffer_mib`
 class RigSelection:
     """A Selection for each camera.
 
-    They share the memory for frames, and when the SfM falls behind, all of them choose fewer. Stamps are unique among
-    the cameras: see `pipeprog_camera.rig`.
+    They share the memory for frames and the keyframes that the map may hold, and when the SfM falls behind, all of
+    them choose fewer. Stamps are unique among the cameras: see `pipeprog_camera.rig`.
+
+    Attributes:
+        names: of the cameras.
+        budget: keyframes that the map holds.
     """
 
     def __init__(self, config: FramesConfig, cameras: Sequence[str] = ()) -> None:
@@ -34,7 +39,8 @@ class RigSelection:
         if len(self.names) > 1 and config.policy == "network":
             raise InputError("policy = network takes one camera: use policy = stream for a rig")
         share = replace(config, buffer_mib=max(config.buffer_mib // len(self.names), _MIN_MIB))
-        self._of = {name: Selection(share) for name in self.names}
+        self.budget = KeyframeBudget(config.max_keyframes)
+        self._of = {name: Selection(share, self.budget) for name in self.names}
         self._frames: dict[str, str] = {}  # frame_id by camera, of a rig's
 
     @property

@@ -14,6 +14,7 @@ from pipeprog_frames.incoming.decoding import GrayImage, is_cut_off, reduced_siz
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile, FrameRing, FrameStore
 from pipeprog_frames.incoming.stamp_order import StampOrder
 from pipeprog_frames.overlap_feedback import OverlapReport
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.policy.selection_policy import Policy, make_policy
 from pipeprog_frames.policy.stream import KeyframeStream
 
@@ -26,8 +27,10 @@ class Selection:
     The policy begins anew, on the next image, where the camera switches to another size and where the clock was set.
     """
 
-    def __init__(self, config: FramesConfig) -> None:
+    def __init__(self, config: FramesConfig, budget: KeyframeBudget | None = None) -> None:
+        """`budget`: of the map; None: no other camera's keyframes are in it."""
         self._config = config
+        self._budget = KeyframeBudget(config.max_keyframes) if budget is None else budget
         self.calibrations = Calibrations(paired=config.lockstep)
         # In a replay the disk that holds the recording can hold its images, too.
         self._store: FrameStore = FrameFile() if config.lockstep else FrameRing(config.buffer_mib << 20)
@@ -92,7 +95,7 @@ class Selection:
             return [(Decision(arrival.stamp, False, DAMAGED), None)]
         selected: Selected = []
         if self._policy is None or self._camera is None:
-            self._policy = make_policy(self._config, camera, self._store.sharpest_between)
+            self._policy = make_policy(self._config, camera, self._store.sharpest_between, self._budget)
         elif (self._camera.width, self._camera.height) != size:
             selected = self._selected(self._policy.begin_anew(camera))
         self._camera = camera

@@ -187,6 +187,7 @@ def test_a_survey_that_is_taken_up_has_its_last_keyframes_published_again(
     assert scene.chosen() == [START + number for number in range(3, KEPT + 2)]
     assert scene.retired[-1].keyframes_published == KEPT + 2
     assert scene._counted("keyframes") == KEPT + 2
+    assert scene._counted("keyframes in the map") == KEPT + 1  # one is retired
 
 
 def test_cameras_that_are_triggered_together_have_stamps_of_their_own(

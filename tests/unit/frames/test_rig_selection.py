@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.rig import unique_stamp
 from pipeprog_frames.config import FramesConfig
+from pipeprog_frames.frame_decision import FULL
 from pipeprog_frames.incoming.arrival import Arrival
 from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.rig_selection import RigSelection
@@ -78,6 +79,15 @@ def test_under_load_all_cameras_choose_fewer(wall: NDArray[np.uint8]) -> None:
         len(chosen([each for each in show(rig, arrivals[9:]) if each[0].stamp % 10 < 2])) for rig in (free, loaded)
     ]
     assert counts[1] < counts[0]
+
+
+def test_the_cameras_share_what_the_map_may_hold(wall: NDArray[np.uint8]) -> None:
+    arrivals = rig_walk(wall, 24)
+    rig = RigSelection(FramesConfig(max_keyframes=8), NAMES)
+    selected = show(rig, arrivals) + rig.flush()
+    assert len(chosen(selected)) == rig.budget.held == 8
+    left_out = [decision for decision, _ in selected if decision.reason == FULL]
+    assert {decision.frame_id for decision in left_out} >= {"left_optical", "right_optical"}
 
 
 def test_a_camera_without_calibration_is_named_and_the_others_go_on(wall: NDArray[np.uint8]) -> None:

@@ -8,7 +8,7 @@ from collections import Counter, defaultdict, deque
 from dataclasses import replace
 
 from pipeprog_bringup.results.result_files import FrameRow
-from pipeprog_frames.frame_decision import FAULTS
+from pipeprog_frames.frame_decision import FAULTS, FULL
 from pipeprog_node.journal import Journal
 
 LOST_AFTER = 3  # keyframes in a row without a place in the map: one may be blurred, two may be its neighbours
@@ -38,6 +38,11 @@ class FrameLog:
     def chosen(self) -> int:
         """Keyframes."""
         return sum(row is not None and row.chosen for row in self._rows)
+
+    @property
+    def beyond_limit(self) -> int:
+        """Frames that would be keyframes, and the map may hold no more."""
+        return sum(row is not None and row.reason == FULL for row in self._rows)
 
     def play(self, stamp: int) -> None:
         """A frame was sent to the selector."""

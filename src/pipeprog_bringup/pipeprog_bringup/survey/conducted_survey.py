@@ -200,6 +200,12 @@ class ConductedSurvey:
         elif now - self._decided > PATIENCE:
             self._missing = f"no image for {now - self._decided:.0f} s: {self._lack() or 'the camera sends none'}"
 
+    def _full(self) -> str:
+        """That the map may hold no more keyframes, and what to do; empty: it may."""
+        count = self._passage.log.beyond_limit
+        limit = "frames would be keyframes, but the map holds as many as max_keyframes of frames allows"
+        return f"{count} {limit}: film the rest in another survey" if count else ""
+
     def _keep_image(self, data: bytes) -> None:
         if not self._stopped:
             self._output.keep_image(deserialize_message(data, CompressedImage), data)
@@ -220,7 +226,7 @@ class ConductedSurvey:
             tracking=log.is_tracking,
             last_known=maps.poses.poses[-1] if maps.poses is not None and maps.poses.poses else PoseStamped(),
             metric=status.metric,
-            advice=PAUSED if self._is_paused else (self._missing or status.message),
+            advice=PAUSED if self._is_paused else (self._missing or self._full() or status.message),
             classes=[] if maps.newest is None else maps.newest.pipes.classes,
             progress=self._progress(),
             elapsed=messages.duration_msg(elapsed),

@@ -11,6 +11,7 @@ from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import Decision, Load
 from pipeprog_frames.overlap_feedback import BestBetween, OverlapReport
 from pipeprog_frames.policy.image_network import ImageNetwork
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.policy.stream import KeyframeStream
 
 
@@ -42,8 +43,11 @@ class Policy(Protocol):
         """The keyframes whose overlap is outside the band in the end, each with the reason."""
 
 
-def make_policy(config: FramesConfig, camera: Camera, best_between: BestBetween) -> Policy:
-    """The policy that `config.policy` names; `best_between` finds a frame between two stamps."""
+def make_policy(config: FramesConfig, camera: Camera, best_between: BestBetween, budget: KeyframeBudget) -> Policy:
+    """The policy that `config.policy` names; `best_between` finds a frame between two stamps.
+
+    `budget`: of the map, which a stream keeps; a network has the keyframes that its overlaps ask for.
+    """
     if config.policy == "network":
         return ImageNetwork(config.overlap_min, config.overlap_min + config.overlap_band, best_between)
-    return KeyframeStream(config, camera, best_between)
+    return KeyframeStream(config, camera, best_between, budget)

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from pipeprog_camera.camera import Camera
 from pipeprog_frames.config import FramesConfig
-from pipeprog_frames.frame_decision import Decision, Load
+from pipeprog_frames.frame_decision import FULL, Decision, Load
 from pipeprog_frames.overlap_feedback import BestBetween, OverlapReport, StreamFeedback
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.policy.selector import FrameSelector
 
 UNLOADED_LAG = 5  # keyframes that the SfM may be behind without load: a bundle adjustment takes seconds at times
@@ -20,14 +21,19 @@ FULL_LAG = 25  # keyframes behind at which the load counts as full: half of what
 
 
 class KeyframeStream:
-    """FrameSelector and StreamFeedback together."""
+    """FrameSelector and StreamFeedback together.
 
-    def __init__(self, config: FramesConfig, camera: Camera, best_between: BestBetween) -> None:
-        self._config, self._camera = config, camera
+    The more keyframes the SfM is behind, and the fuller the `budget` is, the fewer are chosen: the larger of both loads
+    counts. None is chosen while the budget is full.
+    """
+
+    def __init__(self, config: FramesConfig, camera: Camera, best_between: BestBetween, budget: KeyframeBudget) -> None:
+        self._config, self._camera, self._budget = config, camera, budget
+        self._lag_load = 0.0
         self._selector = FrameSelector(config, camera)
         # Parallax as a fraction of the image's width, since keyframes before and after a switch differ in size.
         self._feedback = StreamFeedback(
-            config.overlap_min, config.overlap_min + config.overlap_band, config.parallax_max, best_between
+            config.overlap_min, config.overlap_min + config.overlap_band, config.parallax_max, best_between, budget
         )
 
     @property
@@ -39,6 +45,7 @@ class KeyframeStream:
         """Takes the next frame; see FrameSelector.consider."""
         if self._feedback.knows(stamp):  # after the clock was set back
             return [Decision(stamp, False, "stamp repeats")]
+        self._relax()
         return self._recorded(self._selector.consider(stamp, load))
 
     def flush(self) -> list[Decision]:
@@ -53,12 +60,13 @@ class KeyframeStream:
 
     def lag(self, keyframes: int) -> None:
         """Notes how many keyframes the SfM is behind: the more, the fewer are chosen."""
-        self._selector.limits.relax(min(max((keyframes - UNLOADED_LAG) / (FULL_LAG - UNLOADED_LAG), 0.0), 1.0))
+        self._lag_load = min(max((keyframes - UNLOADED_LAG) / (FULL_LAG - UNLOADED_LAG), 0.0), 1.0)
+        self._relax()
 
     def answer(self, reports: Iterable[OverlapReport], readout: float = 0.0) -> list[Decision]:
         """Takes overlap reports and the read-out in use, s; returns frames to add (chosen) and to retire (not chosen).
 
-        With a rolling shutter keyframes are dense in time, while the SfM keeps up.
+        With a rolling shutter keyframes are dense in time, while there is no load.
         """
         loaded = self.overlap_min < self._config.overlap_min
         self._feedback.max_gap = MAX_GAP if readout and not loaded else None
@@ -72,8 +80,15 @@ class KeyframeStream:
         """Nothing: a stream has no overlap band to keep."""
         return []
 
+    def _relax(self) -> None:
+        self._selector.limits.relax(max(self._lag_load, self._budget.load))
+
     def _recorded(self, decisions: list[Decision]) -> list[Decision]:
-        for decision in decisions:
-            if decision.chosen:
-                self._feedback.chosen(replace(decision, parallax=decision.parallax / self._camera.width))
-        return decisions
+        return [self._allowed(decision) if decision.chosen else decision for decision in decisions]
+
+    def _allowed(self, decision: Decision) -> Decision:
+        """Notes a keyframe; the decision not to take it where the map holds as many as it may."""
+        if self._budget.is_full:
+            return replace(decision, chosen=False, reason=FULL)
+        self._feedback.chosen(replace(decision, parallax=decision.parallax / self._camera.width))
+        return decision

@@ -21,6 +21,7 @@ from pipeprog_detect.product.classification import ClassProgress
 from pipeprog_detect.product.pipe_runs import Joint, PipeRun
 from pipeprog_detect.product.product import Product
 from pipeprog_detect.types import Cylinder, Pipe, PipeEnd
+from pipeprog_frames.frame_decision import FULL
 
 PIPE = Pipe(
     "p03",
@@ -226,6 +227,17 @@ def test_faulty_frames_are_distinguished_from_frames_not_needed() -> None:
         log.decide(row(stamp, False, reason))
     log.skip(4, "damaged message")
     assert log.faults() == ["2 frames left out: damaged image", "1 frames left out: damaged message"]
+
+
+def test_frames_that_a_full_map_does_not_take_are_told() -> None:
+    log = FrameLog()
+    for stamp, reason in ((1, "overlap suffices"), (2, FULL), (3, FULL)):
+        log.play(stamp)
+        log.decide(row(stamp, False, reason))
+    assert log.beyond_limit == 2
+    assert log.faults() == [f"2 frames left out: {FULL} (frame 2, the first of them)"]
+    log.decide(row(2, True, "bridges to a keyframe that did not register"))  # once there is room
+    assert log.beyond_limit == 1
 
 
 def test_settings_are_checked_before_anything_starts() -> None:

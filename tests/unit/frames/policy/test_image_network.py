@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pipeprog_frames.frame_decision import Decision
 from pipeprog_frames.overlap_feedback import OverlapReport, StreamFeedback
 from pipeprog_frames.policy.image_network import START_PERIOD, ImageNetwork
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 
 FEATURES = 2000
 FPS = 30
@@ -174,38 +175,54 @@ def play(feedback: StreamFeedback, walk: Walk, chosen: list[int]) -> tuple[set[i
 def test_a_loose_image_gets_a_frame_on_its_looser_side() -> None:
     walk = Walk(np.r_[np.arange(40) * 0.005, 0.2 + np.arange(40) * 0.015])
     chosen = [walk.stamps[index] for index in (0, 20, 40, 79)]
-    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between), walk, chosen)
+    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between, KeyframeBudget(0)), walk, chosen)
     added = sorted(images - set(chosen))
     assert added
     assert min(added) > chosen[2], "the other gaps are dense enough"
 
 
+def test_where_the_map_is_full_frames_are_added_once_there_is_room() -> None:
+    walk = Walk(np.r_[np.arange(40) * 0.005, 0.2 + np.arange(40) * 0.015])
+    chosen = [walk.stamps[index] for index in (0, 20, 40, 79)]
+    budget = KeyframeBudget(len(chosen))
+    feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between, budget)
+    assert play(feedback, walk, chosen)[0] == set(chosen)
+    budget.held -= 1  # as where another camera's keyframe is retired
+    added = [decision.stamp for decision in feedback.answer((), complete=True) if decision.chosen]
+    assert len(added) == 1
+    assert budget.is_full
+
+
 def test_a_gap_without_frames_and_a_stream_that_fits_change_nothing() -> None:
     walk = steady(10.0, 0.3)
-    _, changes = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between), walk, walk.stamps[::15])
+    _, changes = play(
+        StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between, KeyframeBudget(0)), walk, walk.stamps[::15]
+    )
     assert not changes
     sparse = Walk(walk.place[::60])
-    _, changes = play(StreamFeedback(0.85, 0.875, 1e9, sparse.sharpest_between), sparse, sparse.stamps)
+    _, changes = play(
+        StreamFeedback(0.85, 0.875, 1e9, sparse.sharpest_between, KeyframeBudget(0)), sparse, sparse.stamps
+    )
     assert not changes
 
 
 def test_runs_that_overlap_too_much_lose_every_second_keyframe() -> None:
     walk = steady(10.0, 0.3)
     dense = walk.stamps[::5]  # 0.05 apart: two steps still overlap by 0.9
-    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between), walk, dense)
+    images, _ = play(StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between, KeyframeBudget(0)), walk, dense)
     assert len(images) < 0.6 * len(dense)
     place = walk.place[[(stamp - 1) // PERIOD for stamp in sorted(images)]]
     assert np.diff(place).max() <= 0.15 + 1e-9
-    near, _ = play(StreamFeedback(0.85, 0.875, 6.0, walk.sharpest_between), walk, dense)
+    near, _ = play(StreamFeedback(0.85, 0.875, 6.0, walk.sharpest_between, KeyframeBudget(0)), walk, dense)
     assert near == set(dense), "the parallax asks for each of them"
 
 
 def test_keyframes_that_are_too_far_apart_in_time_get_frames_between() -> None:
     walk = steady(10.0, 0.1)  # 0.1 of the image in a second, so that the overlap alone asks for none
     chosen = walk.stamps[::30]
-    feedback = StreamFeedback(0.5, 1.0, 1e9, walk.sharpest_between)
+    feedback = StreamFeedback(0.5, 1.0, 1e9, walk.sharpest_between, KeyframeBudget(0))
     assert play(feedback, walk, chosen)[0] == set(chosen)
-    feedback = StreamFeedback(0.5, 1.0, 1e9, walk.sharpest_between)
+    feedback = StreamFeedback(0.5, 1.0, 1e9, walk.sharpest_between, KeyframeBudget(0))
     feedback.max_gap = 10 * PERIOD
     images, changes = play(feedback, walk, chosen)
     assert set(chosen) < images
@@ -217,7 +234,7 @@ def test_keyframes_that_are_too_far_apart_in_time_get_frames_between() -> None:
 def test_no_keyframe_is_retired_whose_neighbours_are_too_far_apart_in_time() -> None:
     walk = steady(10.0, 0.3)
     dense = walk.stamps[::5]
-    feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between)
+    feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between, KeyframeBudget(0))
     feedback.max_gap = 9 * PERIOD
     assert play(feedback, walk, dense)[0] == set(dense)
 
@@ -238,7 +255,7 @@ def test_what_is_kept_grows_with_the_site_and_not_with_the_visits() -> None:
     chosen = walk.stamps[::13]
 
     def kept(place_known: bool, max_gap: int | None = None) -> list[int]:
-        feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between)
+        feedback = StreamFeedback(0.85, 0.875, 1e9, walk.sharpest_between, KeyframeBudget(0))
         feedback.max_gap = max_gap
         images: set[int] = set()
         for stamp in chosen:
@@ -269,7 +286,7 @@ def test_nothing_is_added_and_retired_for_ever(
     steps: list[float], blind: frozenset[int], stride: int, overlap_min: float, max_gap: int | None
 ) -> None:
     walk = Walk(np.cumsum(steps), blind)
-    feedback = StreamFeedback(overlap_min, overlap_min + 0.025, 1e9, walk.sharpest_between)
+    feedback = StreamFeedback(overlap_min, overlap_min + 0.025, 1e9, walk.sharpest_between, KeyframeBudget(0))
     feedback.max_gap = max_gap
     _, changes = play(feedback, walk, walk.stamps[::stride])
     assert set(changes.values()) <= {1}

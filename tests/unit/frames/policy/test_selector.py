@@ -16,6 +16,7 @@ from pipeprog_frames.frame_decision import Decision, Load
 from pipeprog_frames.incoming.decoding import decode_reduced, is_cut_off, reduction
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame, FrameFile, FrameRing
 from pipeprog_frames.overlap_feedback import OverlapReport
+from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.policy.selector import FrameSelector
 from pipeprog_frames.policy.stream import MAX_GAP, KeyframeStream
 from pipeprog_frames.tracker import Tracker
@@ -223,7 +224,7 @@ def test_a_long_4k_stream_stays_in_flat_memory(wall: NDArray[np.uint8]) -> None:
     """Ten minutes at 30 Hz, shortened to what fills the ring three times over: 1 MiB a frame."""
     camera = Camera(3840, 2160, 2700.0, 2700.0, 1919.5, 1079.5)
     ring = FrameRing(64 << 20)
-    stream = KeyframeStream(FramesConfig(), camera, ring.sharpest_between)
+    stream = KeyframeStream(FramesConfig(), camera, ring.sharpest_between, KeyframeBudget(0))
     views = [cv2.resize(pan(wall, 2.5 * index), (480, 270)) for index in range(60)]
     peaks = []
     tracemalloc.start()
@@ -246,7 +247,7 @@ def test_keyframes_are_dense_in_time_for_a_rolling_shutter_that_the_sfm_keeps_up
 ) -> None:
     camera = Camera(WIDTH, HEIGHT, 225.0, 225.0, 159.5, 89.5)
     file = FrameFile()
-    stream = KeyframeStream(FramesConfig(), camera, file.sharpest_between)
+    stream = KeyframeStream(FramesConfig(), camera, file.sharpest_between, KeyframeBudget(0))
     chosen = []
     for index in range(60):
         image, stamp = pan(wall, index), 1 + index * 33_333_333
