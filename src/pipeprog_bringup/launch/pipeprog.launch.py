@@ -76,6 +76,11 @@ ARGUMENTS = [
     DeclareLaunchArgument(
         "results", default_value="surveys", description="Folder in which each survey of the action gets its folder."
     ),
+    DeclareLaunchArgument(
+        "cores",
+        default_value="0",
+        description="Processor cores for frames, sfm and detect together, the first of the machine; 0: all.",
+    ),
     DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
     DeclareLaunchArgument(
         "enclaves",
@@ -105,7 +110,10 @@ def pipeprog_node(name: str, parameters: dict, remappings: list) -> Node:
         executable=f"{name}_node",
         name=name,
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file"), {"use_sim_time": truth("use_sim_time"), **parameters}],
+        parameters=[
+            LaunchConfiguration("params_file"),
+            {"use_sim_time": truth("use_sim_time"), "cores": number("cores"), **parameters},
+        ],
         remappings=remappings,
         ros_arguments=ros_arguments(name),
         output="screen",
@@ -122,6 +130,11 @@ def ros_arguments(name: str) -> list:
 def truth(argument: str) -> ParameterValue:
     """The argument as a parameter that is true or false."""
     return ParameterValue(LaunchConfiguration(argument), value_type=bool)
+
+
+def number(argument: str) -> ParameterValue:
+    """The argument as a parameter that is a whole number."""
+    return ParameterValue(LaunchConfiguration(argument), value_type=int)
 
 
 def survey_node(remappings: list) -> LifecycleNode:

@@ -32,3 +32,14 @@ def setting(
     if choices is not None:
         metadata["choices"] = choices
     return cast(Value, field(default=default, metadata=metadata))
+
+
+def cores_setting() -> int:
+    """The setting `cores`, which each node has."""
+    return setting(
+        0,
+        "processor cores for the node and its worker, the first of those that it may use and the same for all nodes; "
+        "0: all",
+        "cores",
+        (0, 1024),  # as many as Linux tells apart in one mask
+    )

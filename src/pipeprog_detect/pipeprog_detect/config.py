@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from pipeprog_camera.setting_field import setting
+from pipeprog_camera.setting_field import cores_setting, setting
 
 
 @dataclass(frozen=True)
@@ -44,4 +44,5 @@ class DetectConfig:
         "paper, every pipe gets a class",
         choices=("posterior", "kmeans"),
     )
+    cores: int = cores_setting()
     contour: ContourConfig = field(default_factory=ContourConfig)

@@ -46,6 +46,7 @@ from pipeprog_detect.worker import (
 )
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
+from pipeprog_node.cores import limit_cores
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
@@ -202,6 +203,7 @@ class DetectNode(Node):
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("detect", parameter_overrides=list(overrides))
         config = declare(self, DetectConfig, extra=("boq", "intermediate", "journal"))
+        limit_cores(config.cores, self.get_logger().warning)
         path = declare_fixed(self, "boq", "", "file of the bill of quantities")
         if not path:
             raise InputError("no bill of quantities: set the parameter boq to its file")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeprog_camera.setting_field import setting
+from pipeprog_camera.setting_field import cores_setting, setting
 
 
 @dataclass(frozen=True)
@@ -56,3 +56,4 @@ class FramesConfig:
         "camera publishes both, or each image arrives twice",
         choices=("any", "raw", "compressed"),
     )
+    cores: int = cores_setting()

@@ -32,6 +32,7 @@ from pipeprog_frames.rig_selection import ONE, RigSelection
 from pipeprog_frames.selection import Selected
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
 from pipeprog_node import messages, qos
+from pipeprog_node.cores import limit_cores
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.discovery import stages_subscribed
 from pipeprog_node.finish import FinishService
@@ -169,6 +170,7 @@ class FramesNode(Node):
     def __init__(self, overrides: Sequence[Parameter] = ()) -> None:
         super().__init__("frames", parameter_overrides=list(overrides))
         self._config = declare(self, FramesConfig, extra=("idle", "cameras", "journal"))
+        limit_cores(self._config.cores, self.get_logger().warning)
         idle = declare_fixed(self, "idle", False, "take no images, until a survey begins")
         if self._config.policy == "network" and not self._config.lockstep:
             raise InputError("policy = network takes a whole recording: use it with `pipeprog replay`, live use stream")

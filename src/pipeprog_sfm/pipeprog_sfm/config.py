@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from pipeprog_camera.limits import MAX_READOUT
 from pipeprog_camera.rolling_shutter import check_readout
-from pipeprog_camera.setting_field import setting
+from pipeprog_camera.setting_field import cores_setting, setting
 
 NOT_TOLD = -1.0  # s, a read-out that is not known
 
@@ -116,6 +116,7 @@ class SfmConfig:
         (NOT_TOLD, MAX_READOUT),
     )
     map_interval: int = setting(5, "number of keyframes between two publications of the map", "", (1, 1000))
+    cores: int = cores_setting()
     mapper: MapperConfig = field(default_factory=MapperConfig)
     deblur: DeblurConfig = field(default_factory=DeblurConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)

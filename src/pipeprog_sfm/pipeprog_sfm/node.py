@@ -31,6 +31,7 @@ from pipeprog_camera.limits import (
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
 from pipeprog_node.camera_transforms import FRAME, CameraTransforms
+from pipeprog_node.cores import limit_cores
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
@@ -275,6 +276,7 @@ class SfmNode(Node):
         super().__init__("sfm", parameter_overrides=list(overrides))
         extra = ("board", "colmap", "lockstep", "intermediate", "publish_tf", "reference", "journal")
         config = declare(self, SfmConfig, extra=extra)
+        limit_cores(config.cores, self.get_logger().warning)
         board = declare_fixed(self, "board", "", "file of the boards on site")
         intermediate = declare_fixed(
             self, "intermediate", True, "publish maps while keyframes come, not the last alone"
