@@ -4,18 +4,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pipeprog_bringup.results.atomic_output import JOURNAL, left_behind
+from pipeprog_bringup.survey.sign_of_life import is_alive, sign
 from pipeprog_camera.errors import InputError
 from pipeprog_node.journal import Journal
 
 _NAME = "survey.journal"
-_ALIVE = 60.0  # s since the last sign of life, in which a supervisor starts a node anew; later the robot is elsewhere
+_LIFE = "survey.alive"  # the node's signs of life, beside its journal
 
 
 @dataclass
@@ -61,10 +60,11 @@ class SurveyJournal:
 
     def __init__(self, folder: Path, goal: bytes) -> None:
         """`folder`: that of the nodes' journals; `goal` is of a survey that begins. Raises InputError."""
-        self._path = folder / _NAME
+        self._path, self._life = folder / _NAME, folder / _LIFE
         self.frames = Journal(self._path)
         self.progress: Progress = self.frames.note or Progress(goal)
         self.note()
+        self.live()
 
     def note(self) -> None:
         """Writes the progress down."""
@@ -74,7 +74,7 @@ class SurveyJournal:
     def live(self) -> None:
         """A sign of life, due every few seconds."""
         with contextlib.suppress(OSError):
-            os.utime(self._path)
+            sign(self._life)
 
     def forget_nodes(self) -> None:
         """Removes what the other nodes have written: the survey begins once more."""
@@ -95,20 +95,14 @@ class Unfinished:
     goal: bytes
 
 
-def is_alive(file: Path) -> bool:
-    """Whether a process that is not there any more gave a sign of life, by touching this file, a moment ago."""
-    return file.is_file() and abs(time.time() - file.stat().st_mtime) <= _ALIVE
-
-
 def unfinished(results: Path) -> Unfinished | None:
     """The survey in the folder `results` that was conducted a moment ago, and is not any more; None without one."""
     for survey in results.iterdir() if results.is_dir() else ():
         for folder in left_behind(survey):
-            file = folder / JOURNAL / _NAME
-            if not is_alive(file):
+            if not is_alive(folder / JOURNAL / _LIFE):
                 continue
             with contextlib.suppress(InputError):
-                journal = Journal(file)
+                journal = Journal(folder / JOURNAL / _NAME)
                 journal.close()
                 if isinstance(journal.note, Progress):
                     return Unfinished(folder, journal.note.goal)

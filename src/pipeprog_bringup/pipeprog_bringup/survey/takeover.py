@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rclpy.serialization import deserialize_message, serialize_message
 
-from pipeprog_bringup.survey.survey_journal import is_alive
+from pipeprog_bringup.survey.sign_of_life import is_alive, sign
 from pipeprog_msgs.action import Survey
 
 SIGN_PERIOD = 1.0  # s between two signs of life
@@ -34,7 +34,7 @@ class Takeover:
         with contextlib.suppress(OSError):
             if not self._active.exists():
                 self._folder.mkdir(parents=True, exist_ok=True)
-            self._active.touch()
+            sign(self._active)
 
     def end(self) -> None:
         """Notes that the node is not active any more."""

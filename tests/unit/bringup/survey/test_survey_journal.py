@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
 
-from pipeprog_bringup.survey.survey_journal import Progress, SurveyJournal
+from pipeprog_bringup.results.atomic_output import JOURNAL
+from pipeprog_bringup.survey import sign_of_life
+from pipeprog_bringup.survey.survey_journal import Progress, SurveyJournal, Unfinished, unfinished
 
 
 def test_a_pause_is_not_filmed() -> None:
@@ -55,3 +58,14 @@ def test_a_survey_that_is_taken_up_is_paused_as_before(tmp_path: Path) -> None:
     taken_up = SurveyJournal(tmp_path, b"goal").progress
     assert taken_up.is_paused
     assert taken_up.filmed(1000.0) == pytest.approx(30.0)
+
+
+def test_a_survey_goes_on_though_the_clock_was_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    killed = tmp_path / "monday" / ".pipeprog-killed"
+    (killed / JOURNAL).mkdir(parents=True)
+    SurveyJournal(killed / JOURNAL, b"goal").close()
+    now, since_start = time.time(), sign_of_life._now()
+    monkeypatch.setattr(time, "time", lambda: now + 7200.0)
+    assert unfinished(tmp_path) == Unfinished(killed, b"goal")
+    monkeypatch.setattr(sign_of_life, "_now", lambda: since_start + 120.0)
+    assert unfinished(tmp_path) is None  # the robot is elsewhere

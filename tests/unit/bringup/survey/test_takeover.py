@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import os
-import time
 from pathlib import Path
 
 import pytest
 
+from pipeprog_bringup.survey import sign_of_life
 from pipeprog_bringup.survey.takeover import Takeover
 from pipeprog_msgs.action import Survey
 
@@ -50,10 +49,11 @@ def test_another_node_of_the_same_folder_takes_nothing_over(tmp_path: Path) -> N
     assert other.answer_to(Survey.Goal(survey_id="monday")) is None
 
 
-def test_a_node_that_was_ended_or_is_long_gone_leaves_nothing(tmp_path: Path) -> None:
+def test_a_node_that_was_ended_or_is_long_gone_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    long_ago = sign_of_life._now() - 3600.0
+    monkeypatch.setattr(sign_of_life, "_now", lambda: long_ago)
     left_by_one_that_was_killed(tmp_path)
-    long_ago = time.time() - 3600.0
-    os.utime(tmp_path / ".spot.survey" / "active", (long_ago, long_ago))
+    monkeypatch.undo()
     assert not Takeover(tmp_path, NAME).was_active
     one = Takeover(tmp_path, NAME)
     one.sign()
