@@ -110,12 +110,13 @@ def profiles(names: GraphNames) -> dict[str, list[Profile]]:
     """
     clock = ("/clock",) if names.use_sim_time else ()
     is_raw = names.image_transport == "raw"
+    cameras = _camera_topics(names, raw=is_raw, compressed=not is_raw)
     keyframes = (*_KEYFRAMES, "keyframes/retired")
     return {
         "frames": _stage(
             "frames",
             publish=("frame_decisions", *keyframes),
-            subscribe=(*_camera_topics(names, raw=is_raw, compressed=not is_raw), "image_overlap", "survey/paused", *clock),
+            subscribe=(*cameras, "image_overlap", "survey/paused", *clock),
         ),
         "sfm": _stage(
             "sfm",
@@ -174,7 +175,7 @@ def _survey(names: GraphNames, clock: tuple[str, ...]) -> Profile:
     recorded = (*_camera_topics(names), names.odometry, names.imu, *_TRANSFORMS) if names.record else ()
     return Profile(
         "survey",
-        publish=("/rosout", _EVENTS, "progress", "~/paused", "~/transition_event"),
+        publish=("/rosout", _EVENTS, "progress", "~/transition_event"),
         subscribe=(*recorded, *clock),
         reply=("~/end", "~/pause", _TYPES, *_own(_PARAMETERS), *_own(_LIFECYCLE)),
         execute=("survey",),
@@ -186,7 +187,7 @@ def _survey_listener() -> Profile:
     services = ("finish", "renew", *_PARAMETERS)
     return Profile(
         "survey_listener",
-        publish=("/rosout", _EVENTS),
+        publish=("/rosout", _EVENTS, "survey/paused"),
         subscribe=("frame_decisions", "image_overlap", *_KEYFRAMES, *_MAP, "pipes", "pipe_markers", "/diagnostics"),
         reply=(_TYPES, *_own(_PARAMETERS)),
         request=tuple(f"{stage}/{service}" for stage in _STAGES for service in services),
