@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from pipeprog_bringup.playback.frame_log import LiveFrameLog
 from pipeprog_bringup.playback.listener import LastMessages
 from pipeprog_bringup.results import result_files
+from pipeprog_bringup.survey.advice import advice
 from pipeprog_bringup.survey.alignment_result import note_alignment
 from pipeprog_bringup.survey.goal import Goal
 from pipeprog_bringup.survey.missing_input import PATIENCE
@@ -217,6 +218,10 @@ class ConductedSurvey:
     def _feedback(self, elapsed: float) -> Survey.Feedback:
         passage = self._passage
         log, status, maps = passage.log, passage.listener.status, passage.maps
+        last_known = maps.poses.poses[-1] if maps.poses is not None and maps.poses.poses else None
+        position = None if last_known is None else last_known.pose.position
+        place = None if position is None else (position.x, position.y, position.z)
+        is_lost = passage.stage == Survey.Feedback.FILMING and not log.is_tracking
         return Survey.Feedback(
             state=passage.stage,
             frames=log.considered,
@@ -224,9 +229,9 @@ class ConductedSurvey:
             registered=status.keyframes_registered,
             waiting=status.keyframes_waiting,
             tracking=log.is_tracking,
-            last_known=maps.poses.poses[-1] if maps.poses is not None and maps.poses.poses else PoseStamped(),
+            last_known=last_known or PoseStamped(),
             metric=status.metric,
-            advice=PAUSED if self._is_paused else (self._missing or self._full() or status.message),
+            advice=PAUSED if self._is_paused else advice(self._missing, is_lost, place, self._full() or status.message),
             classes=[] if maps.newest is None else maps.newest.pipes.classes,
             progress=self._progress(),
             elapsed=messages.duration_msg(elapsed),

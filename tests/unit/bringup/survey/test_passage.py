@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
@@ -21,67 +18,15 @@ from std_msgs.msg import Bool
 from pipeprog_bringup.playback.frame_log import LiveFrameLog
 from pipeprog_bringup.survey import passage as passages
 from pipeprog_bringup.survey.goal import Goal, read_site
-from pipeprog_bringup.survey.passage import CONFIGS, MAX_RESTARTS, Passage, SurveyFailure
+from pipeprog_bringup.survey.passage import MAX_RESTARTS, Passage, SurveyFailure
 from pipeprog_msgs.action import Survey
-from pipeprog_msgs.srv import Finish, Renew
+from pipeprog_msgs.srv import Finish
 from pipeprog_node import qos
-from pipeprog_node.diagnostics import PROCESS
+from tests.unit.bringup.survey.fake_graph import TICK, Graph
 
 BAGS = Path(__file__).parents[4] / "bags"
-TICK = 0.02  # s
 TIMEOUT = 60.0  # s, for what takes one on an idle machine
 FRAMES, KEYFRAMES = 0, 7  # inputs of frames and of sfm
-
-
-class Graph:
-    """The services and diagnostics of the three nodes; `die` has one come back as another process.
-
-    Attributes:
-        asked: what was called, in order: node, service, and the request's fields that count.
-        answers: of each node's Finish, in order; None: it dies over it.
-    """
-
-    def __init__(self) -> None:
-        self.node = Node("graph")
-        self.asked: list[tuple[Any, ...]] = []
-        self.answers: dict[str, deque[Finish.Response | None]] = {name: deque() for name in CONFIGS}
-        self._processes: Counter[str] = Counter(dict.fromkeys(CONFIGS, 100))
-        group = ReentrantCallbackGroup()
-        for name in CONFIGS:
-            self.node.create_service(Renew, f"{name}/renew", self._renew(name), callback_group=group)
-            self.node.create_service(Finish, f"{name}/finish", self._finish(name), callback_group=group)
-        self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.node.create_timer(TICK, self._tell)
-
-    def die(self, name: str) -> None:
-        self._processes[name] += 1
-
-    def _tell(self) -> None:
-        told = [
-            DiagnosticStatus(name=f"{name}: health", values=[KeyValue(key=PROCESS, value=str(number))])
-            for name, number in self._processes.items()
-        ]
-        self._diagnostics.publish(DiagnosticArray(status=told))
-
-    def _renew(self, name: str) -> Callable[..., Renew.Response]:
-        def renew(request: Renew.Request, response: Renew.Response) -> Renew.Response:
-            self.asked.append((name, "renew", request.idle, Path(request.journal).name))
-            response.success = True
-            return response
-
-        return renew
-
-    def _finish(self, name: str) -> Callable[..., Any]:
-        async def finish(request: Finish.Request, response: Finish.Response) -> Finish.Response:
-            self.asked.append((name, "finish", request.expected_inputs))
-            answer = self.answers[name].popleft()
-            if answer is None:
-                self.die(name)
-                await Future()
-            assert answer is not None
-            return answer
-
-        return finish
 
 
 class Stage:
@@ -90,7 +35,7 @@ class Stage:
     def __init__(self) -> None:
         self.graph, self._listener = Graph(), Node("listener")
         self._executor = SingleThreadedExecutor()
-        for node in (self.graph.node, self._listener):
+        for node in (*self.graph.nodes, self._listener):
             self._executor.add_node(node)
         self._waiting: list[Future] = []
         self._listener.create_timer(TICK, self._wake)
@@ -116,7 +61,7 @@ class Stage:
 
     def close(self) -> None:
         self._executor.shutdown()
-        for node in (self.graph.node, self._listener):
+        for node in (*self.graph.nodes, self._listener):
             node.destroy_node()
 
     async def _tick(self) -> None:

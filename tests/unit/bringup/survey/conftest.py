@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stage of the node `survey`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeprog_bringup.survey import passage
+from tests.unit.bringup.survey.survey_stage import SurveyStage, survey_stage
+
+
+@pytest.fixture
+def surveys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SurveyStage]:
+    """The node `survey` with the bill and the board of the demo; its folders are in `surveys`."""
+    monkeypatch.setattr(passage, "missing_connections", lambda *_: [])  # the fake nodes do not subscribe
+    with survey_stage(tmp_path / "surveys") as stage:
+        yield stage
