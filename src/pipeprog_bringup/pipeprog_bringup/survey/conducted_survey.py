@@ -26,6 +26,7 @@ from pipeprog_bringup.survey.missing_input import PATIENCE
 from pipeprog_bringup.survey.passage import Cancelled, Passage, SurveyFailure
 from pipeprog_bringup.survey.survey_journal import SurveyJournal
 from pipeprog_bringup.survey.survey_output import SurveyOutput
+from pipeprog_bringup.survey.time_remaining import TimeRemaining
 from pipeprog_bringup.survey.waiting_client import Client
 from pipeprog_camera.errors import InputError
 from pipeprog_msgs.action import Survey
@@ -67,6 +68,7 @@ class ConductedSurvey:
         self._is_full = False
         self._considered, self._decided = 0, math.inf  # images decided on, and when the last of them came
         self._missing = ""
+        self._remaining = TimeRemaining()
         log = LiveFrameLog(journal.frames)
         self._passage = Passage(node, self._tick, lambda: client.is_cancel_requested and not self._stopped, log)
         depth = qos.reliable(DEPTH)
@@ -222,6 +224,7 @@ class ConductedSurvey:
         position = None if last_known is None else last_known.pose.position
         place = None if position is None else (position.x, position.y, position.z)
         is_lost = passage.stage == Survey.Feedback.FILMING and not log.is_tracking
+        progress = self._progress()
         return Survey.Feedback(
             state=passage.stage,
             frames=log.considered,
@@ -233,8 +236,9 @@ class ConductedSurvey:
             metric=status.metric,
             advice=PAUSED if self._is_paused else advice(self._missing, is_lost, place, self._full() or status.message),
             classes=[] if maps.newest is None else maps.newest.pipes.classes,
-            progress=self._progress(),
+            progress=progress,
             elapsed=messages.duration_msg(elapsed),
+            estimated_time_remaining=messages.duration_msg(self._remaining.at(elapsed, progress)),
         )
 
     def _progress(self) -> float:

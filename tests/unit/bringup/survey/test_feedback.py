@@ -3,14 +3,20 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
+from builtin_interfaces.msg import Duration
 from geometry_msgs.msg import PoseStamped
 from rclpy.task import Future
 
 from pipeprog_bringup.playback.frame_log import LOST_AFTER
 from pipeprog_bringup.survey import conducted_survey
 from pipeprog_bringup.survey.advice import advice
+from pipeprog_bringup.survey.time_remaining import TimeRemaining
 from pipeprog_msgs.action import Survey
+from pipeprog_msgs.srv import Finish
+from pipeprog_node import messages
 from tests.unit.bringup.survey.survey_stage import SurveyStage
 
 
@@ -86,5 +92,57 @@ def test_nobody_is_to_walk_back_once_filming_has_ended(surveys: SurveyStage) -> 
     surveys.until(lambda: surveys.stage == Survey.Feedback.RECONSTRUCTING)
     assert not surveys.feedback[-1].tracking
     assert surveys.feedback[-1].advice == ""
+    surveys.cancel(handle)
+    surveys.result(handle)
+
+
+def test_time_that_remains_is_unknown_before_the_work_moves() -> None:
+    remaining = TimeRemaining()
+    assert remaining.at(100.0, math.nan) == 0.0  # filming
+    assert remaining.at(110.0, 0.3) == 0.0  # what was done while filming tells no pace
+    assert remaining.at(115.0, 0.3) == 0.0
+    assert remaining.at(120.0, 0.3 + 1e-9) == 0.0  # one of many keyframes: years by its pace
+    assert remaining.at(120.0, 0.4) == pytest.approx(60.0)
+
+
+def test_time_that_remains_follows_the_pace_since_filming_and_counts_down() -> None:
+    remaining = TimeRemaining()
+    remaining.at(100.0, 0.2)
+    assert remaining.at(110.0, 0.4) == pytest.approx(30.0)  # 0.2 in 10 s, 0.6 are left
+    assert remaining.at(115.0, 0.4) == pytest.approx(25.0)
+    assert remaining.at(120.0, 0.8) == pytest.approx(20.0 / 3.0)  # 0.6 in 20 s, 0.2 are left
+
+
+def test_time_that_remains_is_unknown_where_the_work_takes_longer_than_expected() -> None:
+    remaining = TimeRemaining()
+    remaining.at(100.0, 0.0)
+    assert remaining.at(110.0, 0.5) == pytest.approx(10.0)
+    assert remaining.at(150.0, 0.5) == 0.0
+
+
+def test_the_time_that_remains_is_told_after_filming(surveys: SurveyStage) -> None:
+    surveys.activate()
+    handle = surveys.film(survey_id="timed")
+    graph = surveys.graph
+    graph.add_keyframe(True)
+    surveys.until(lambda: surveys.feedback[-1].keyframes == 1)
+    assert math.isnan(surveys.feedback[-1].progress)
+    graph.answers["frames"].append(Finish.Response(success=True, outputs=1))
+    mapped = Future()
+    graph.answers["sfm"].append(mapped)
+    graph.answers["detect"].append(Future())
+    surveys.end()
+    surveys.until(lambda: surveys.stage == Survey.Feedback.RECONSTRUCTING)
+    mapped.set_result(Finish.Response(success=True, outputs=1))
+    surveys.until(lambda: surveys.stage == Survey.Feedback.MEASURING)
+    unknown = Duration()
+    assert all(told.estimated_time_remaining == unknown for told in surveys.feedback if told.state < told.MEASURING)
+    began, now = (
+        next(told for told in surveys.feedback if told.state == state)
+        for state in (Survey.Feedback.RECONSTRUCTING, Survey.Feedback.MEASURING)
+    )
+    worked = messages.seconds(now.elapsed) - messages.seconds(began.elapsed)
+    expected = worked * (1.0 - now.progress) / (now.progress - began.progress)
+    assert messages.seconds(now.estimated_time_remaining) == pytest.approx(expected, rel=1e-3)
     surveys.cancel(handle)
     surveys.result(handle)
