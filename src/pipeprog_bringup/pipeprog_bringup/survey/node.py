@@ -100,10 +100,33 @@ class SurveyNode(LifecycleNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """No goal is accepted any more; the survey that is filmed goes on to its result."""
+        self._end_activity()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Refused while a survey goes on to its result: a manager waits for seconds, a survey may take minutes."""
+        if self._running is not None:
+            self.get_logger().error(
+                f"cleanup refused: the survey {self._running.name} is not over: wait for its result, or cancel it"
+            )
+            return TransitionCallbackReturn.FAILURE
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As `on_deactivate`: a shutdown cannot be refused, and the process goes on until it gets a signal."""
+        self._end_activity()
+        return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """An exception in a transition leads to the state unconfigured, from which the node can be configured again."""
+        self._end_activity()
+        self.get_logger().error(f"a transition from the state {state.label} has failed: configure the node again")
+        return super().on_error(state)
+
+    def _end_activity(self) -> None:
         self._is_active = False
         self._takeover.end()
         self._end_asked = True
-        return super().on_deactivate(state)
 
     def _take_up(self) -> None:
         """Becomes active where the process before was, when it was killed, and its survey goes on."""
