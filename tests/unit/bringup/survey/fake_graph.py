@@ -76,6 +76,11 @@ class Graph:
     def die(self, name: str) -> None:
         self._processes[name] += 1
 
+    def leave(self, name: str) -> None:
+        """The services of this node are not there any more."""
+        for service in [each for each in self.node.services if each.srv_name.startswith(f"{name}/")]:
+            self.node.destroy_service(service)
+
     @property
     def is_heard(self) -> bool:
         """Whether a survey has found all that the graph publishes."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A survey's way through nodes that die: each takes it up from its journal, and is asked again what it has not said."""
+"""A survey's way through the graph, which may give no map, and through nodes that die or do not answer.
+
+One that dies takes the survey up from its journal, and is asked again what it has not answered.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,13 @@ from rclpy.task import Future
 from std_msgs.msg import Bool
 
 from pipeprog_bringup.playback.frame_log import LiveFrameLog
+from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_bringup.survey import passage as passages
 from pipeprog_bringup.survey.goal import Goal, read_site
 from pipeprog_bringup.survey.passage import MAX_RESTARTS, Passage, SurveyFailure
+from pipeprog_frames.frame_decision import UNCALIBRATED
 from pipeprog_msgs.action import Survey
+from pipeprog_msgs.msg import SfmStatus
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import qos
 from tests.unit.bringup.survey.fake_graph import TICK, Graph
@@ -132,8 +138,87 @@ def test_a_node_that_is_started_anew_hears_of_the_pause(stage: Stage, tmp_path: 
     stage.begin(tmp_path)
     stage.passage.pause(True)
     heard: list[bool] = []
-    late = stage.graph.node
+    late = stage.graph.nodes[0]
     late.create_subscription(Bool, "survey/paused", lambda message: heard.append(message.data), qos.latched())
     stage.spin_until(lambda: heard == [True])
     stage.run(stage.passage.rest())
     stage.spin_until(lambda: heard == [True, False])
+
+
+@pytest.mark.parametrize(
+    ("reason", "code", "told"),
+    [
+        ("", Survey.Result.NO_IMAGES, "no image has come"),
+        (UNCALIBRATED, Survey.Result.NO_CALIBRATION, "no usable CameraInfo has come"),
+        ("blurred", Survey.Result.NO_MAP, "no image could be used as a keyframe: 1 x blurred"),
+    ],
+)
+def test_a_survey_without_keyframes_says_why(stage: Stage, tmp_path: Path, reason: str, code: int, told: str) -> None:
+    stage.begin(tmp_path)
+    if reason:
+        stage.passage.log.decide(FrameRow(1, False, reason))
+    stage.graph.answers["frames"].append(Finish.Response(success=True, outputs=0))
+    with pytest.raises(SurveyFailure, match=told) as failure:
+        stage.run(stage.passage.work_off())
+    assert failure.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "told"),
+    [
+        (SfmStatus(models=1, message="no board was seen"), Survey.Result.NO_SCALE, "no board was seen"),
+        (SfmStatus(models=0, message="film textured surroundings"), Survey.Result.NO_MAP, "film textured surroundings"),
+        (SfmStatus(models=2, message="two parts"), Survey.Result.NO_MAP, "two parts"),
+        (SfmStatus(models=1, metric=True), Survey.Result.NO_MAP, "the SfM says why"),
+    ],
+)
+def test_a_survey_without_a_map_says_why(stage: Stage, tmp_path: Path, status: SfmStatus, code: int, told: str) -> None:
+    stage.begin(tmp_path)
+    stage.passage.listener.status = status
+    stage.graph.answers["frames"].append(Finish.Response(success=True, outputs=KEYFRAMES))
+    stage.graph.answers["sfm"].append(Finish.Response(success=False, message="the SfM says why"))
+    with pytest.raises(SurveyFailure, match=told) as failure:
+        stage.run(stage.passage.work_off())
+    assert failure.value.code == code
+
+
+def test_a_node_that_does_not_answer_ends_the_survey(
+    stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage.begin(tmp_path)
+    monkeypatch.setattr(passages, "FINISH_SECONDS", 10 * TICK)
+    stage.graph.answers["frames"].append(Future())
+    with pytest.raises(SurveyFailure, match="the node frames has not answered") as failure:
+        stage.run(stage.passage.work_off())
+    assert failure.value.code == Survey.Result.TIMEOUT
+
+
+def test_a_node_that_is_not_there_ends_the_survey(
+    stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage.graph.leave("frames")
+    monkeypatch.setattr(passages, "DELIVERY_SECONDS", 10 * TICK)
+    with pytest.raises(SurveyFailure, match="the node frames is not there") as failure:
+        stage.begin(tmp_path)
+    assert failure.value.code == Survey.Result.TIMEOUT
+
+
+def test_nodes_that_do_not_find_each_other_end_the_survey(
+    stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage.begin(tmp_path)
+    monkeypatch.setattr(passages, "missing_connections", lambda *_: ["detect does not subscribe to map_points"])
+    monkeypatch.setattr(passages, "DELIVERY_SECONDS", 10 * TICK)
+    with pytest.raises(SurveyFailure, match="the nodes have not found each other") as failure:
+        stage.run(stage.passage.go_on({}))
+    assert failure.value.code == Survey.Result.TIMEOUT
+
+
+def test_pipes_that_do_not_come_end_the_survey(stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage.begin(tmp_path)
+    monkeypatch.setattr(passages, "DELIVERY_SECONDS", 1.0)
+    for name, outputs in (("frames", KEYFRAMES), ("sfm", 2), ("detect", 1)):
+        stage.graph.answers[name].append(Finish.Response(success=True, outputs=outputs))
+    with pytest.raises(SurveyFailure, match="the last pipes have not come") as failure:
+        stage.run(stage.passage.work_off())
+    assert failure.value.code == Survey.Result.TIMEOUT
