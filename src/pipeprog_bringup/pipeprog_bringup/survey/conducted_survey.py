@@ -146,7 +146,7 @@ class ConductedSurvey:
         result.sfm = passage.listener.status
         if self._is_full and not result.error_code:
             result.error_code = Survey.Result.NO_SPACE
-            result.error_msg = f"filming ended early: the disk of {output.path} is nearly full"
+            result.error_msg = f"filming ended early: {output.lack_of_room}"
         if not passage.log.considered:
             output.discard()
             return result

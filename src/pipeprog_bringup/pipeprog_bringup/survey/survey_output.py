@@ -57,9 +57,7 @@ class SurveyOutput:
         self._folder = self._open.enter_context(OutputFolder(self.path, left=left))
         if not self.has_room:
             self.discard()
-            raise InputError(
-                f"less than {MIN_FREE >> 30} GiB is free for {self.path}: make room, or change the parameter results"
-            )
+            raise InputError(self.lack_of_room)
         self._recording = self._bag("out.mcap")
         version = result_files.package_version("pipeprog") or "unknown"
         self._recording.describe({"site": goal.site.boq_path.stem, "survey": goal.name, "pipeprog": version})
@@ -141,6 +139,11 @@ class SurveyOutput:
     def has_room(self) -> bool:
         """Whether the disk has room for what a survey writes at its end."""
         return shutil.disk_usage(self.path).free >= MIN_FREE
+
+    @property
+    def lack_of_room(self) -> str:
+        """What is said where there is none, with the remedy."""
+        return f"less than {MIN_FREE >> 30} GiB is free for {self.path}: make room, or change the parameter results"
 
     def _keep_filmed(self) -> None:
         """Writes the keyframes that no message has brought: the selector's journal has all that were published.

@@ -33,6 +33,19 @@ START = 1_700_000_000_000_000_000  # ns, of the first image
 PERIOD = 200_000_000  # ns between two images
 CAMERA = Camera(64, 36, 45.0, 45.0, 31.5, 17.5)
 JPEG = cv2.imencode(".jpg", np.full((CAMERA.height, CAMERA.width), 128, np.uint8))[1].tobytes()
+MAP = SurveyMap(  # of one keyframe with one point
+    frame="night1",
+    aligned_by="",
+    scale_sigma=1e-4,
+    stamps=np.array([START]),
+    cameras=(Camera(480, 270, 340.0, 340.0, 239.5, 134.5),),
+    map_from_camera=np.eye(4)[None],
+    offsets=np.array([0, 1]),
+    pixels=np.zeros((1, 2), np.float32),
+    descriptors=np.zeros((1, 128), np.uint8),
+    point_of=np.array([0]),
+    points=np.array([[0.0, 0.0, 2.0]]),
+)
 
 
 class Graph:

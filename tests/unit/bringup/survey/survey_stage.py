@@ -80,6 +80,14 @@ class SurveyStage:
         self.until(lambda: self.stage == Survey.Feedback.FILMING and self.graph.is_heard)
         return handle
 
+    def film_a_map(self, **goal: Any) -> Any:
+        """The handle of a goal of which a map with a pipe is there."""
+        handle = self.film(**goal)
+        self.graph.add_keyframe(True)
+        self.graph.publish_map(1)
+        self.until(lambda: self.feedback[-1].classes)
+        return handle
+
     @property
     def stage(self) -> int:
         """State of the last feedback; 0: none has come."""

@@ -16,30 +16,16 @@ from hypothesis import strategies as st
 from pipeprog_bringup.survey.alignment_result import note_alignment
 from pipeprog_bringup.survey.goal import MAX_TIME, Site, check_goal, read_reference, read_site
 from pipeprog_bringup.survey.survey_output import SurveyOutput
-from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import for_terminal
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import SfmStatus
 from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
-from pipeprog_sfm.alignment.survey_map import SurveyMap
+from tests.unit.bringup.survey.fake_graph import MAP
 
 BAGS = Path(__file__).parents[4] / "bags"
 BOQ, BOARD = BAGS / "demo.boq.yaml", BAGS / "demo.board.yaml"
 NOW = 1_700_000_000_000_000_000  # ns, 2023-11-14 22:13:20 UTC
-MAP = SurveyMap(  # of one keyframe with one point
-    frame="night1",
-    aligned_by="",
-    scale_sigma=1e-4,
-    stamps=np.array([NOW]),
-    cameras=(Camera(480, 270, 340.0, 340.0, 239.5, 134.5),),
-    map_from_camera=np.eye(4)[None],
-    offsets=np.array([0, 1]),
-    pixels=np.zeros((1, 2), np.float32),
-    descriptors=np.zeros((1, 128), np.uint8),
-    point_of=np.array([0]),
-    points=np.array([[0.0, 0.0, 2.0]]),
-)
 
 
 @pytest.fixture(scope="module")

@@ -17,15 +17,6 @@ from pipeprog_msgs.srv import Finish
 from tests.unit.bringup.survey.survey_stage import SurveyStage
 
 
-def film_a_map(surveys: SurveyStage, **goal: str) -> object:
-    """The handle of a goal of which a map with a pipe is there."""
-    handle = surveys.film(**goal)
-    surveys.graph.add_keyframe(True)
-    surveys.graph.publish_map(1)
-    surveys.until(lambda: surveys.feedback[-1].classes)
-    return handle
-
-
 @pytest.mark.parametrize(
     ("transition", "state"),
     [(Transition.TRANSITION_DEACTIVATE, "inactive"), (Transition.TRANSITION_ACTIVE_SHUTDOWN, "finalized")],
@@ -34,7 +25,7 @@ def test_a_node_that_is_not_active_any_more_brings_its_survey_to_the_result(
     surveys: SurveyStage, transition: int, state: str
 ) -> None:
     surveys.activate()
-    handle = film_a_map(surveys, survey_id="last")
+    handle = surveys.film_a_map(survey_id="last")
     surveys.let_finish(keyframes=1, revision=1)
     assert surveys.change(transition)
     assert surveys.state == state
@@ -47,7 +38,7 @@ def test_a_node_that_is_not_active_any_more_brings_its_survey_to_the_result(
 
 def test_cleanup_is_refused_until_the_survey_is_over(surveys: SurveyStage) -> None:
     surveys.activate()
-    handle = film_a_map(surveys, survey_id="last")
+    handle = surveys.film_a_map(survey_id="last")
     mapped = Future()
     surveys.let_finish(keyframes=1, revision=1)
     surveys.graph.answers["sfm"][0] = mapped

@@ -83,7 +83,6 @@ class Stage:
 
 @pytest.fixture
 def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stage]:
-    monkeypatch.setattr(passages, "missing_connections", lambda *_: [])
     monkeypatch.setattr(passages, "MATCHING_SECONDS", 2 * TICK)
     rclpy.init()
     stage = Stage()

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How surveys end without their client's asking, and what is left then."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Duration
+
+from pipeprog_bringup.survey import survey_output
+from pipeprog_bringup.survey.survey_output import MIN_FREE
+from pipeprog_msgs.action import Survey
+from pipeprog_node import messages
+from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
+from tests.unit.bringup.survey.fake_graph import MAP
+from tests.unit.bringup.survey.survey_stage import SurveyStage
+
+
+class Disk:
+    """Stands for shutil in the module that writes: `free` bytes of every disk."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.free = MIN_FREE
+        monkeypatch.setattr(survey_output, "shutil", SimpleNamespace(disk_usage=lambda path: self))
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    return Disk(monkeypatch)
+
+
+def test_a_survey_for_which_the_disk_has_no_room_does_not_begin(
+    surveys: SurveyStage, disk: Disk, tmp_path: Path
+) -> None:
+    surveys.activate()
+    disk.free = MIN_FREE - 1
+    answer = surveys.result(surveys.send(survey_id="full"))
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert answer.result.error_code == Survey.Result.BAD_INPUT
+    folder = tmp_path / "surveys" / "full"
+    assert answer.result.error_msg == (
+        f"less than 1 GiB is free for {folder}: make room, or change the parameter results"
+    )
+    assert not folder.exists()
+    assert surveys.graph.asked == []  # no node has begun
+
+
+def test_filming_ends_early_where_the_disk_gets_full_and_keeps_what_was_measured(
+    surveys: SurveyStage, disk: Disk
+) -> None:
+    surveys.activate()
+    handle = surveys.film_a_map(survey_id="filled")
+    surveys.let_finish(keyframes=1, revision=1)
+    disk.free = MIN_FREE - 1
+    answer = surveys.result(handle)
+    assert (answer.status, answer.result.error_code) == (GoalStatus.STATUS_SUCCEEDED, Survey.Result.NO_SPACE)
+    assert answer.result.error_msg.startswith("filming ended early: less than 1 GiB is free for ")
+    assert "make room" in answer.result.error_msg
+    assert [pipe.id for pipe in answer.result.pipes.pipes] == ["p01"]
+    assert (Path(answer.result.folder) / "pipes.json").is_file()
+
+
+def test_filming_ends_after_its_time_limit(surveys: SurveyStage) -> None:
+    surveys.activate()
+    surveys.let_finish(keyframes=1, revision=1)
+    handle = surveys.send(survey_id="limited", time_limit=Duration(sec=1))
+    surveys.until(lambda: surveys.graph.is_heard)
+    surveys.graph.add_keyframe(True)
+    surveys.graph.publish_map(1)
+    answer = surveys.result(handle)  # nobody has called the service end
+    assert (answer.status, answer.result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, "")
+    assert messages.seconds(answer.result.total_elapsed_time) >= 1.0
+    assert [pipe.id for pipe in answer.result.pipes.pipes] == ["p01"]
+
+
+def test_a_survey_whose_reference_is_not_found_again_keeps_its_pipes(surveys: SurveyStage, tmp_path: Path) -> None:
+    earlier = tmp_path / "surveys" / "monday"
+    earlier.mkdir(parents=True)
+    write_map(earlier / MAP_FILE, MAP)
+    surveys.activate()
+    handle = surveys.film_a_map(survey_id="tuesday", reference="monday")
+    surveys.graph.map = MAP  # in a frame of its own
+    surveys.graph.report(metric=True, message="no keyframe shows a place of the reference")
+    surveys.until(lambda: surveys.feedback[-1].advice)
+    surveys.let_finish(keyframes=1, revision=1)
+    surveys.end()
+    answer = surveys.result(handle)
+    assert (answer.status, answer.result.error_code) == (GoalStatus.STATUS_SUCCEEDED, Survey.Result.NOT_ALIGNED)
+    assert answer.result.error_msg == "no keyframe shows a place of the reference"
+    assert [pipe.id for pipe in answer.result.pipes.pipes] == ["p01"]
+    assert not answer.result.reference_covariance.any()
+    assert (Path(answer.result.folder) / "pipes.json").is_file()
