@@ -81,6 +81,12 @@ ARGUMENTS = [
         default_value="0",
         description="Processor cores for frames, sfm and detect together, the first of the machine; 0: all.",
     ),
+    DeclareLaunchArgument(
+        "record",
+        default_value="false",
+        choices=["true", "false"],
+        description="Keep what the robot sends during each survey of the action as recording.mcap in its folder.",
+    ),
     DeclareLaunchArgument("namespace", default_value="", description="Namespace of the nodes and their topics."),
     DeclareLaunchArgument(
         "enclaves",
@@ -148,7 +154,7 @@ def survey_node(remappings: list) -> LifecycleNode:
         condition=IfCondition(LaunchConfiguration("survey")),
         parameters=[
             LaunchConfiguration("params_file"),
-            {"results": text("results"), "use_sim_time": truth("use_sim_time"), **files},
+            {"results": text("results"), "record": truth("record"), "use_sim_time": truth("use_sim_time"), **files},
         ],
         remappings=remappings,
         ros_arguments=ros_arguments("survey"),

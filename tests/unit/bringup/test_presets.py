@@ -71,3 +71,18 @@ def test_launched_executables_are_those_of_the_packages() -> None:
     assert sorted(launched) == sorted(NODE_CONFIGS)
     for name in launched:
         assert f'"{name}_node = pipeprog_{name}.node:main"' in (ROOT / f"src/pipeprog_{name}/setup.py").read_text()
+
+
+def test_the_launch_file_gives_each_parameter_of_the_node_survey() -> None:
+    launch = BRINGUP / "launch" / "pipeprog.launch.py"
+    (function,) = [
+        node
+        for node in ast.walk(ast.parse(launch.read_text()))
+        if isinstance(node, ast.FunctionDef) and node.name == "survey_node"
+    ]
+    given = {node.value for node in ast.walk(function) if isinstance(node, ast.Constant)}
+    declared = calls(BRINGUP / "pipeprog_bringup" / "survey" / "node.py", "declare_fixed")
+    parameters = {ast.literal_eval(call.args[1]) for call in declared}
+    assert "record" in parameters
+    assert parameters <= given
+    assert parameters <= {argument_name(call) for call in calls(launch, "DeclareLaunchArgument")}
