@@ -53,16 +53,18 @@ class ConductedSurvey:
         tick: Callable[[], Awaitable[None]],
         is_end_asked: Callable[[], bool],
         lack: Callable[[], str],
+        lack_of_odometry: Callable[[], str],
         keep: Callable[[Survey.Result], None],
     ) -> None:
         """`node` is this survey's alone; `tick` waits for a moment.
 
-        `is_end_asked`: filming is to end; `lack`: why no images come, empty: not known; `keep` keeps the result for the
-        case that this process is killed before it answers. Where `journal` tells of a process that was killed, the
-        survey goes on from there.
+        `is_end_asked`: filming is to end; `lack` and `lack_of_odometry`: why no images and no odometry come, empty: not
+        known; `keep` keeps the result for the case that this process is killed before it answers. Where `journal` tells
+        of a process that was killed, the survey goes on from there.
         """
         self._client, self._goal, self._output, self._journal = client, goal, output, journal
-        self._wait, self._is_end_asked, self._lack, self._keep = tick, is_end_asked, lack, keep
+        self._wait, self._is_end_asked, self._keep = tick, is_end_asked, keep
+        self._lack, self._lack_of_odometry = lack, lack_of_odometry
         self._started = self._told = self._looked = time.monotonic()
         self._stopped = False  # a cancel is heard until it is obeyed
         self._is_full = False
@@ -195,11 +197,12 @@ class ConductedSurvey:
         await self._wait()
 
     def _look_for_input(self, now: float) -> None:
-        """Says why no images come, once they have not for a while."""
+        """Says why no images come, once they have not for a while, and why nothing tells the scale."""
         passage = self._passage
         is_filming = passage.stage == Survey.Feedback.FILMING and not self._is_paused
         if not is_filming or passage.log.considered > self._considered or self._decided > now:
-            self._considered, self._decided, self._missing = passage.log.considered, now, ""
+            self._considered, self._decided = passage.log.considered, now
+            self._missing = self._missing_scale() if is_filming else ""
         elif now - self._decided > PATIENCE:
             self._missing = f"no image for {now - self._decided:.0f} s: {self._lack() or 'the camera sends none'}"
 
@@ -208,6 +211,17 @@ class ConductedSurvey:
         count = self._passage.log.beyond_limit
         limit = "frames would be keyframes, but the map holds as many as max_keyframes of frames allows"
         return f"{count} {limit}: film the rest in another survey" if count else ""
+
+    def _missing_scale(self) -> str:
+        """Why a map has no metres, where odometry should tell them: without a board, and without a reference.
+
+        A rig of cameras tells the scale with the first map, so that nothing is said there.
+        """
+        status, goal = self._passage.listener.status, self._goal
+        if status.metric or not status.keyframes_registered or goal.site.board_path or goal.reference is not None:
+            return ""
+        lack = self._lack_of_odometry()
+        return lack and f"nothing tells the scale: {lack}"
 
     def _keep_image(self, data: bytes) -> None:
         if not self._stopped:

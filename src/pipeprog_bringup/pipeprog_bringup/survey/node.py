@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from pipeprog_bringup.survey.conducted_survey import ConductedSurvey
 from pipeprog_bringup.survey.goal import check_goal, read_reference, read_site
-from pipeprog_bringup.survey.missing_input import missing_input
+from pipeprog_bringup.survey.missing_input import missing_input, missing_odometry
 from pipeprog_bringup.survey.progress import site_progress
 from pipeprog_bringup.survey.robot_input import RobotInput
 from pipeprog_bringup.survey.survey_journal import unfinished
@@ -213,9 +213,17 @@ class SurveyNode(LifecycleNode):
         self.executor.add_node(listener)
         robot = RobotInput(self, output, self._cameras) if self._record else None
         try:
-            ended, lack = (lambda: self._end_asked), (lambda: missing_input(self, self._cameras))
             self._survey = ConductedSurvey(
-                listener, client, goal, output, journal, self._tick, ended, lack, self._takeover.keep
+                listener,
+                client,
+                goal,
+                output,
+                journal,
+                self._tick,
+                is_end_asked=lambda: self._end_asked,
+                lack=lambda: missing_input(self, self._cameras),
+                lack_of_odometry=lambda: missing_odometry(self),
+                keep=self._takeover.keep,
             )
             result = await self._survey.run()
         finally:

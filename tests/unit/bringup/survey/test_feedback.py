@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 from builtin_interfaces.msg import Duration
@@ -17,7 +18,14 @@ from pipeprog_bringup.survey.time_remaining import TimeRemaining
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages
-from tests.unit.bringup.survey.survey_stage import SurveyStage
+from tests.unit.bringup.survey.fake_graph import Graph
+from tests.unit.bringup.survey.survey_stage import SurveyStage, survey_stage
+
+
+def keeps_filming(graph: Graph) -> bool:
+    """Another image that is no keyframe."""
+    graph.pass_over("overlap")
+    return True
 
 
 def test_missing_input_is_told_before_lost_tracking_and_that_before_the_problem_of_the_sfm() -> None:
@@ -144,5 +152,34 @@ def test_the_time_that_remains_is_told_after_filming(surveys: SurveyStage) -> No
     worked = messages.seconds(now.elapsed) - messages.seconds(began.elapsed)
     expected = worked * (1.0 - now.progress) / (now.progress - began.progress)
     assert messages.seconds(now.estimated_time_remaining) == pytest.approx(expected, rel=1e-3)
+    surveys.cancel(handle)
+    surveys.result(handle)
+
+
+def test_odometry_that_does_not_come_is_told_where_there_is_no_board(tmp_path: Path) -> None:
+    with survey_stage(tmp_path / "surveys", board="''") as surveys:
+        surveys.activate()
+        handle = surveys.film(survey_id="no_metres")
+        graph = surveys.graph
+        graph.add_keyframe(True)
+        graph.report(models=1, keyframes_registered=2, message="the scale is not known")
+        surveys.until(lambda: surveys.feedback[-1].advice.startswith("nothing tells the scale: nobody publishes /odom"))
+        graph.report(models=1, keyframes_registered=2, metric=True)  # by a rig, or by TF
+        surveys.until(lambda: keeps_filming(graph) and surveys.feedback[-1].advice == "")
+        surveys.cancel(handle)
+        surveys.result(handle)
+
+
+def test_nothing_is_said_of_odometry_where_a_board_tells_the_scale(
+    surveys: SurveyStage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conducted_survey, "ROOM_PERIOD", 0.1)  # s; it looks for input more often than it tells
+    surveys.activate()
+    handle = surveys.film(survey_id="board")
+    surveys.graph.report(models=1, keyframes_registered=2, message="film the board from more sides")
+    surveys.until(lambda: surveys.feedback[-1].advice)
+    told_before = len(surveys.feedback)
+    surveys.until(lambda: keeps_filming(surveys.graph) and len(surveys.feedback) > told_before + 2)
+    assert {told.advice for told in surveys.feedback} == {"", "film the board from more sides"}
     surveys.cancel(handle)
     surveys.result(handle)

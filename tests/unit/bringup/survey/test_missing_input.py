@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said where no images come: names, QoS, and nothing while all is well."""
+"""What is said where images or odometry do not come: names, QoS, and nothing while all is well."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import rclpy
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
-from pipeprog_bringup.survey.missing_input import missing_input
+from pipeprog_bringup.survey.missing_input import missing_input, missing_odometry
 from pipeprog_node import qos
 
 
@@ -61,3 +62,26 @@ def test_qos_that_does_not_fit_is_told_of_both_sides(nodes: tuple[Node, Node, No
     frames.create_subscription(CompressedImage, "image/compressed", lambda _: None, qos.reliable(1))
     told = until(lambda: missing_input(survey), "driver offers best effort", "frames asks for reliable")
     assert told.startswith("/image/compressed")
+
+
+def test_the_nearest_topic_of_odometry_is_named(nodes: tuple[Node, Node, Node]) -> None:
+    survey, _, driver = nodes
+    until(lambda: missing_odometry(survey), "nobody publishes /odometry, nor anything else of", "hang up a board")
+    driver.create_publisher(Odometry, "/spot/odometry", 1)
+    until(lambda: missing_odometry(survey), "nearest topic of that kind is /spot/odometry: remap it")
+
+
+def test_all_is_well_once_odometry_is_received(nodes: tuple[Node, Node, Node]) -> None:
+    survey, sfm, driver = nodes
+    driver.create_publisher(Odometry, "odometry", qos.sensor(1))
+    until(lambda: missing_odometry(survey), "/odometry is published", "sfm does not subscribe")
+    sfm.create_subscription(Odometry, "odometry", lambda _: None, qos.sensor(1))
+    until(lambda: missing_odometry(survey))
+
+
+def test_qos_of_odometry_that_does_not_fit_is_told_of_both_sides(nodes: tuple[Node, Node, Node]) -> None:
+    survey, sfm, driver = nodes
+    driver.create_publisher(Odometry, "odometry", qos.sensor(1))
+    sfm.create_subscription(Odometry, "odometry", lambda _: None, qos.reliable(1))
+    told = until(lambda: missing_odometry(survey), "driver offers best effort", "asks for reliable")
+    assert told.startswith("/odometry")
