@@ -24,3 +24,8 @@ def note_alignment(result: Survey.Result, path: Path) -> None:
     reason = _BEFORE_ALIGNMENT if survey is None else result.sfm.message
     result.error_code = Survey.Result.NOT_ALIGNED
     result.error_msg = "; ".join(filter(None, (reason, result.error_msg)))
+
+
+def is_aligned(result: Survey.Result) -> bool:
+    """Whether the pipes of a survey that was written lie in the frame of its reference."""
+    return bool(result.folder) and bool(result.reference_covariance.any())

@@ -20,6 +20,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+from pipeprog_bringup.survey.alignment_result import is_aligned
 from pipeprog_bringup.survey.conducted_survey import ConductedSurvey
 from pipeprog_bringup.survey.goal import check_goal, read_reference, read_site
 from pipeprog_bringup.survey.missing_input import missing_input, missing_odometry
@@ -233,7 +234,7 @@ class SurveyNode(LifecycleNode):
                 robot.close()
             self.executor.remove_node(listener)
             listener.destroy_node()
-        if goal.reference is not None and result.folder and result.error_code == Survey.Result.NONE:
+        if goal.reference is not None and is_aligned(result):
             folders = goal.reference.path.parent, Path(result.folder)
             self.executor.create_task(self._publish_progress, *folders, result.pipes.header)
         return result

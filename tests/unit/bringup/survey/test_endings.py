@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
 
+from pipeprog_bringup.survey import node as survey_node
 from pipeprog_bringup.survey import survey_output
 from pipeprog_bringup.survey.survey_output import MIN_FREE
 from pipeprog_msgs.action import Survey
-from pipeprog_node import messages
+from pipeprog_msgs.msg import SiteProgress
+from pipeprog_node import messages, qos
 from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
 from tests.unit.bringup.survey.fake_graph import MAP
 from tests.unit.bringup.survey.survey_stage import SurveyStage
@@ -76,12 +80,18 @@ def test_filming_ends_after_its_time_limit(surveys: SurveyStage) -> None:
     assert [pipe.id for pipe in answer.result.pipes.pipes] == ["p01"]
 
 
-def test_a_survey_whose_reference_is_not_found_again_keeps_its_pipes(surveys: SurveyStage, tmp_path: Path) -> None:
+@pytest.fixture
+def monday(tmp_path: Path) -> str:
+    """The name of an earlier survey."""
     earlier = tmp_path / "surveys" / "monday"
     earlier.mkdir(parents=True)
     write_map(earlier / MAP_FILE, MAP)
+    return earlier.name
+
+
+def test_a_survey_whose_reference_is_not_found_again_keeps_its_pipes(surveys: SurveyStage, monday: str) -> None:
     surveys.activate()
-    handle = surveys.film_a_map(survey_id="tuesday", reference="monday")
+    handle = surveys.film_a_map(survey_id="tuesday", reference=monday)
     surveys.graph.map = MAP  # in a frame of its own
     surveys.graph.report(metric=True, message="no keyframe shows a place of the reference")
     surveys.until(lambda: surveys.feedback[-1].advice)
@@ -93,3 +103,38 @@ def test_a_survey_whose_reference_is_not_found_again_keeps_its_pipes(surveys: Su
     assert [pipe.id for pipe in answer.result.pipes.pipes] == ["p01"]
     assert not answer.result.reference_covariance.any()
     assert (Path(answer.result.folder) / "pipes.json").is_file()
+
+
+@pytest.fixture
+def told(surveys: SurveyStage, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """The surveys of which it was told what has changed between them, as the robot hears it."""
+    heard: list[tuple[str, str]] = []
+    surveys.robot.create_subscription(
+        SiteProgress, "progress", lambda message: heard.append((message.earlier, message.later)), qos.latched()
+    )
+    monkeypatch.setattr(
+        survey_node,
+        "site_progress",
+        lambda earlier, later, header: SiteProgress(header=header, earlier=earlier.name, later=later.name),
+    )
+    return heard
+
+
+@pytest.mark.parametrize("is_full", [False, True])
+def test_what_has_changed_since_the_reference_is_told_of_each_survey_that_is_aligned(
+    surveys: SurveyStage, disk: Disk, monday: str, told: list[tuple[str, str]], is_full: bool
+) -> None:
+    surveys.activate()
+    handle = surveys.film_a_map(survey_id="tuesday", reference=monday)
+    covariance = np.diag([4e-6] * 3 + [1e-8] * 3 + [1e-9])
+    surveys.graph.map = replace(MAP, aligned_by="places", alignment_covariance=covariance)
+    surveys.let_finish(keyframes=1, revision=1)
+    if is_full:
+        disk.free = MIN_FREE - 1
+    else:
+        surveys.end()
+    answer = surveys.result(handle)
+    assert answer.status == GoalStatus.STATUS_SUCCEEDED
+    assert answer.result.error_code == (Survey.Result.NO_SPACE if is_full else Survey.Result.NONE)
+    surveys.until(lambda: told)
+    assert told == [("monday", "tuesday")]
