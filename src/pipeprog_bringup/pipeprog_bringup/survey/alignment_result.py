@@ -15,6 +15,8 @@ _BEFORE_ALIGNMENT += "survey is aligned, and this one was ended before"
 def note_alignment(result: Survey.Result, path: Path) -> None:
     """Notes how well the survey lies in the frame of its reference, or NOT_ALIGNED and why.
 
+    The code of a survey that has failed stays, since NOT_ALIGNED says that the pipes can be used.
+
     `path`: of the map.npz of a survey with pipes; it is there where the last map was made.
     """
     survey = read_map(path) if path.is_file() else None
@@ -22,7 +24,8 @@ def note_alignment(result: Survey.Result, path: Path) -> None:
         result.reference_covariance = survey.alignment_covariance[:6, :6].ravel()
         return
     reason = _BEFORE_ALIGNMENT if survey is None else result.sfm.message
-    result.error_code = Survey.Result.NOT_ALIGNED
+    if result.error_code in (Survey.Result.NONE, Survey.Result.NO_SPACE):
+        result.error_code = Survey.Result.NOT_ALIGNED
     result.error_msg = "; ".join(filter(None, (reason, result.error_msg)))
 
 

@@ -17,6 +17,7 @@ from pipeprog_bringup.survey import survey_output
 from pipeprog_bringup.survey.survey_output import MIN_FREE
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import SiteProgress
+from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
 from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
 from tests.unit.bringup.survey.fake_graph import MAP
@@ -103,6 +104,20 @@ def test_a_survey_whose_reference_is_not_found_again_keeps_its_pipes(surveys: Su
     assert [pipe.id for pipe in answer.result.pipes.pipes] == ["p01"]
     assert not answer.result.reference_covariance.any()
     assert (Path(answer.result.folder) / "pipes.json").is_file()
+
+
+def test_a_survey_with_a_reference_whose_last_map_could_not_be_measured_has_failed(
+    surveys: SurveyStage, monday: str
+) -> None:
+    surveys.activate()
+    handle = surveys.film_a_map(survey_id="tuesday", reference=monday)
+    surveys.let_finish(keyframes=1, revision=2)
+    surveys.graph.answers["detect"][0] = Finish.Response(message="the last map could not be measured")
+    surveys.end()
+    answer = surveys.result(handle)
+    assert (answer.status, answer.result.error_code) == (GoalStatus.STATUS_ABORTED, Survey.Result.UNKNOWN)
+    assert "the last map could not be measured" in answer.result.error_msg
+    assert "the pipes are in a frame of their own" in answer.result.error_msg
 
 
 @pytest.fixture
