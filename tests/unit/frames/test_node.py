@@ -86,9 +86,13 @@ class Stage:
         node.create_subscription(CameraInfo, "keyframes/camera_info", lambda _: None, qos.reliable(50))
         if stage:
             node.create_service(Finish, "~/finish", lambda request, response: response)
+        self.host(node)
+        return node
+
+    def host(self, node: Node) -> None:
+        """Has another node run beside the others."""
         self._executor.add_node(node)
         self._added.append(node)
-        return node
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -449,6 +453,16 @@ def test_in_a_pause_images_are_passed_over_and_a_new_track_begins_afterwards(
     assert said[shown[0]] == "first frame"
     assert len(set(scene.chosen()) & set(shown)) >= 4
     assert not scene.retired
+
+
+def test_a_node_that_is_started_anew_in_a_pause_hears_of_it(stage: Callable[..., Stage]) -> None:
+    scene = stage()
+    paused = scene.others.create_publisher(Bool, "survey/paused", qos.latched())
+    paused.publish(Bool(data=True))
+    scene.spin_until(lambda: "paused" in scene.node._health()[1])
+    late = FramesNode()
+    scene.host(late)
+    scene.spin_until(lambda: "paused" in late._health()[1])
 
 
 def test_a_survey_without_a_keyframe_ends_with_a_remedy(stage: Callable[..., Stage]) -> None:
