@@ -46,7 +46,7 @@ class GraphNames:
         imu: topic of the IMU.
         image_transport: raw or compressed: which topics of images `frames` subscribes to.
         use_sim_time: whether the nodes subscribe to /clock.
-        record: as the parameter of `survey`: whether it subscribes to what the robot sends.
+        record: whether `survey` subscribes to what the robot sends.
         publish_tf: as the parameter of `sfm`: whether it publishes on /tf.
     """
 

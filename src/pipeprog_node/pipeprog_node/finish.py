@@ -19,9 +19,10 @@ _PERIOD = 1.0  # s
 class FinishService:
     """One request at a time: the node is told when it comes, asks whether it is due, and answers it.
 
-    A request while another is pending gets the answer of that one where it expects as many inputs: the client of
-    before may have died. Else it is refused at once, and so is one whose inputs do not come for PATIENCE seconds:
-    the number that it expects may be wrong, and nobody else could finish the survey.
+    The client of a pending request may have died. A further one gets its answer where it expects as many inputs; else
+    it has its turn after that one, if the inputs of that one have come, and is refused at once if they have not. A
+    request whose inputs do not come for PATIENCE seconds is refused, too: the number that it expects may be wrong, and
+    nobody else could finish the survey.
     """
 
     def __init__(self, node: Node, received: Callable[[], int], begin: Callable[[], None]) -> None:
@@ -54,7 +55,9 @@ class FinishService:
             pending.set_result((outputs, problem))
 
     async def _on_request(self, request: Finish.Request, response: Finish.Response) -> Finish.Response:
-        if self._pending is not None and request.expected_inputs != self._expected:
+        while (pending := self._pending) is not None and self._is_other(request) and self.is_due:
+            await pending
+        if self._is_other(request):
             response.message = (
                 f"another request is pending, for {self._expected} inputs of which {self._received()} have come: "
                 "wait for its answer"
@@ -69,6 +72,10 @@ class FinishService:
         response.outputs, response.message = await done
         response.success = not response.message
         return response
+
+    def _is_other(self, request: Finish.Request) -> bool:
+        """Whether a request is pending that expects another number of inputs."""
+        return self._pending is not None and request.expected_inputs != self._expected
 
     def _watch(self) -> None:
         if self._pending is None or self.is_due:

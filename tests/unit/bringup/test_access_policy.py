@@ -22,7 +22,7 @@ from tests.access import Access, allowed
 from tests.unit.bringup.launch_description import described
 
 NODES = ["frames", "sfm", "detect", "survey"]
-SETTINGS = {"record", "publish_tf"}  # of the parameter file, not of the launch file
+SETTINGS = {"publish_tf"}  # of the parameter file, not of the launch file
 # Parts of the format of SROS2: element -> attributes, elements within it.
 FORMAT: dict[str, tuple[set[str], set[str]]] = {
     "policy": ({"version"}, {"enclaves"}),
@@ -73,9 +73,12 @@ def test_each_output_has_one_node_that_may_publish_it() -> None:
 def test_one_camera_has_the_topics_that_the_launch_file_gives_it() -> None:
     camera: dict[str, Any] = {"image": "/camera/image_raw", "camera_info": "camera/info"}
     compressed = allowed(policy_xml(GraphNames(**camera)))
-    assert subscriptions(compressed, "/frames") == {"/camera/image_raw/compressed", "/camera/info", "/image_overlap"}
+    own = {"/image_overlap", "/survey/paused"}
+    assert subscriptions(compressed, "/frames") == {"/camera/image_raw/compressed", "/camera/info"} | own
     raw = allowed(policy_xml(GraphNames(**camera, image_transport="raw", namespace="robot7")))
-    assert subscriptions(raw, "/robot7/frames") == {"/camera/image_raw", "/robot7/camera/info", "/robot7/image_overlap"}
+    assert subscriptions(raw, "/robot7/frames") == {"/camera/image_raw", "/robot7/camera/info"} | {
+        f"/robot7{name}" for name in own
+    }
     recorded = allowed(policy_xml(GraphNames(**camera, compressed_image="/camera/jpeg", record=True)))
     assert subscriptions(recorded, "/survey") == {
         *("/camera/image_raw", "/camera/jpeg", "/camera/info"),

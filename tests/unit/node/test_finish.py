@@ -22,8 +22,8 @@ class Stage:
     def __init__(self) -> None:
         rclpy.init()
         self.node = Node("stage")
-        self.received = self.begun = 0
-        self.service = finish.FinishService(self.node, lambda: self.received, self._begin)
+        self.received = self.begun = self.looked = 0  # looked: times that the service has asked what has come
+        self.service = finish.FinishService(self.node, self._look, self._begin)
         self._client = self.node.create_client(Finish, "~/finish")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
@@ -31,6 +31,10 @@ class Stage:
 
     def _begin(self) -> None:
         self.begun += 1
+
+    def _look(self) -> int:
+        self.looked += 1
+        return self.received
 
     def call(self, expected: int) -> Future:
         return self._client.call_async(Finish.Request(expected_inputs=expected))
@@ -72,6 +76,22 @@ def test_a_second_request_for_other_inputs_is_refused_while_one_is_pending(stage
     stage.service.answer(0, "no image could be used")
     stage.spin_until(third.done)
     assert (third.result().success, third.result().message) == (False, "no image could be used")
+
+
+def test_a_request_for_other_inputs_has_its_turn_after_one_whose_inputs_have_come(stage: Stage) -> None:
+    first = stage.call(3)  # of a client that died while the node works
+    stage.spin_until(lambda: stage.service.expected == 3)
+    stage.received, stage.looked = 3, 0
+    second = stage.call(4)
+    stage.spin_until(lambda: stage.looked)  # it has come
+    stage.service.answer(1)
+    stage.spin_until(lambda: stage.service.expected == 4)
+    stage.received = 4
+    stage.service.answer(2)
+    for asked, outputs in ((first, 1), (second, 2)):
+        stage.spin_until(asked.done)
+        assert (asked.result().success, asked.result().outputs) == (True, outputs)
+    assert stage.begun == 2
 
 
 def test_inputs_that_never_come_are_not_waited_for(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:

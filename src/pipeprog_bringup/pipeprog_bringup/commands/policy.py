@@ -64,7 +64,7 @@ def policy(
         Transport, typer.Option(help="Which topics of images are subscribed. Example: `--image-transport raw`")
     ] = Transport.compressed,
     use_sim_time: Annotated[bool, typer.Option("--use-sim-time", help="The nodes take the time from /clock.")] = False,
-    record: Annotated[bool, typer.Option("--record", help="The parameter record of the node survey is true.")] = False,
+    record: Annotated[bool, typer.Option("--record", help="The node survey records what the robot sends.")] = False,
     publish_tf: Annotated[
         bool, typer.Option("--publish-tf", help="The parameter publish_tf of the node sfm is true.")
     ] = False,

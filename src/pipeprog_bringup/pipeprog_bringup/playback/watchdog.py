@@ -32,6 +32,10 @@ class Watchdog:
             self._processes[name] = process
             self._restarted.append(name)
 
+    def knows(self, name: str) -> bool:
+        """Whether a node has been heard: only then it is noticed that it is started anew."""
+        return name in self._heard
+
     def restarted(self) -> list[str]:
         """The nodes that have died and were started anew since the last call."""
         names, self._restarted = self._restarted, []

@@ -174,11 +174,11 @@ class Passage:
         if sum(self._lives.values()) > MAX_RESTARTS:
             text = f"nodes of the graph have died {MAX_RESTARTS + 1} times, the last was {name}: see its output"
             raise SurveyFailure(Survey.Result.PROCESS_DIED, text)
-        if name not in self._begun:
-            return
         life, matched = self._lives[name], time.monotonic() + MATCHING_SECONDS
         while time.monotonic() < matched:
             await self._wait()
+        if name not in self._begun:
+            return
         if self._lives[name] == life:  # it has not died meanwhile
             await self._renewed(name, **self._begun[name])
         if self._lives[name] == life and name == "sfm" and self._map_asked is not None:
@@ -186,11 +186,16 @@ class Passage:
 
     async def _renewed(self, name: str, **fields: Any) -> None:
         client = self._renew[name]
-        await self._until(client.service_is_ready, DELIVERY_SECONDS, f"the node {name} is not there")
+        await self._until(lambda: self._is_there(name), DELIVERY_SECONDS, f"the node {name} is not there")
         request = srv.Renew.Request(**fields)
         answer = await self._answer(lambda: client.call_async(request), name, ANSWER_SECONDS)
         if not answer.success:
             raise SurveyFailure(Survey.Result.BAD_INPUT, answer.message)
+
+    def _is_there(self, name: str) -> bool:
+        """Whether a node can be asked to begin: its death over that must be noticed."""
+        full_name = next(full for full, short in self._names.items() if short == name)
+        return self._renew[name].service_is_ready() and self._watchdog.knows(full_name)
 
     async def _finished(self, name: str, expected: int) -> srv.Finish.Response:
         client: Client = self._finish[name]

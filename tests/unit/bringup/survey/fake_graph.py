@@ -56,6 +56,8 @@ class Graph:
         asked: what was called, in order: node, service, and the request's fields that count.
         answers: of each node's Finish, in order; a future: it works until that is done; None: it dies over it.
         map: what the SfM writes as map.npz when it finishes; None: nothing.
+        dying: nodes that die over the next call of Renew.
+        is_silent: whether no diagnostics are sent.
     """
 
     def __init__(self) -> None:
@@ -64,6 +66,8 @@ class Graph:
         self.nodes = [self.node, *settings]
         self.map: SurveyMap | None = None
         self.asked: list[tuple[Any, ...]] = []
+        self.dying: list[str] = []
+        self.is_silent = False
         self.answers: dict[str, deque[Finish.Response | Future | None]] = {name: deque() for name in CONFIGS}
         self._processes: Counter[str] = Counter(dict.fromkeys(CONFIGS, 100))
         group = ReentrantCallbackGroup()
@@ -93,6 +97,11 @@ class Graph:
         """The services of this node are not there any more."""
         for service in [each for each in self.node.services if each.srv_name.startswith(f"{name}/")]:
             self.node.destroy_service(service)
+
+    @property
+    def is_found(self) -> bool:
+        """Whether a survey would hear the diagnostics."""
+        return self._diagnostics.get_subscription_count() > 0
 
     @property
     def is_heard(self) -> bool:
@@ -147,15 +156,21 @@ class Graph:
         return messages.path(messages.header(int(stamps[-1]), "map"), stamps, poses)
 
     def _tell(self) -> None:
+        if self.is_silent:
+            return
         told = [
             DiagnosticStatus(name=f"{name}: health", values=[KeyValue(key=PROCESS, value=str(number))])
             for name, number in self._processes.items()
         ]
         self._diagnostics.publish(DiagnosticArray(status=told))
 
-    def _renew(self, name: str) -> Callable[..., Renew.Response]:
-        def renew(request: Renew.Request, response: Renew.Response) -> Renew.Response:
+    def _renew(self, name: str) -> Callable[..., Any]:
+        async def renew(request: Renew.Request, response: Renew.Response) -> Renew.Response:
             self.asked.append((name, "renew", request.idle, Path(request.journal).name))
+            if name in self.dying:
+                self.dying.remove(name)
+                self.die(name)
+                await Future()
             if request.colmap:
                 self._folder = Path(request.colmap).parent
             response.success = True

@@ -7,7 +7,7 @@ One that dies takes the survey up from its journal, and is asked again what it h
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +47,11 @@ class Stage:
         self._listener.create_timer(TICK, self._wake)
         self.passage = Passage(self._listener, self._tick, lambda: False, LiveFrameLog())
 
+    def start(self, coroutine: Any) -> Any:
+        return self._executor.create_task(coroutine)
+
     def run(self, coroutine: Any) -> Any:
-        task = self._executor.create_task(coroutine)
+        task = self.start(coroutine)
         self.spin_until(task.done)
         if task.exception() is not None:
             raise task.exception()
@@ -110,6 +113,18 @@ def test_a_node_that_dies_takes_the_survey_up_and_is_asked_again(stage: Stage, t
         ("detect", "renew", False, "journal"),
         ("detect", "finish", 2),
     ]
+
+
+def test_a_node_that_dies_before_it_was_heard_begins_once_it_is_there_again(stage: Stage, tmp_path: Path) -> None:
+    stage.graph.is_silent, stage.graph.dying = True, ["frames"]
+    site = read_site(str(BAGS / "demo.boq.yaml"), "")
+    goal = Goal("survey", site, 0.0)
+    begun = stage.start(stage.passage.begin(goal, tmp_path / "colmap", tmp_path / "journal"))
+    stage.spin_until(lambda: stage.graph.is_found)
+    stage.graph.is_silent = False  # one that is asked before this dies unnoticed
+    stage.spin_until(begun.done)
+    assert begun.exception() is None
+    assert [name for name, *_ in stage.graph.asked] == ["frames", "frames", "detect", "sfm", "frames"]
 
 
 def test_a_map_that_may_not_have_arrived_is_made_again(stage: Stage, tmp_path: Path) -> None:
