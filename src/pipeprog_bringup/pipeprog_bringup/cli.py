@@ -32,6 +32,7 @@ from pipeprog_bringup.commands.speech import fail
 from pipeprog_bringup.commands.view import view
 
 _INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
+_KEEPING = {"patrol", "simulate-patrol"}  # commands that cancel a survey after Ctrl-C, which leaves its folder
 
 app = typer.Typer(
     name="pipeprog",
@@ -92,7 +93,9 @@ def main() -> None:
         fail(f"{error.filename or 'input or output'}: {error.strerror or error}")
         sys.exit(1)
     if code == _INTERRUPTED:  # typer makes an exit status of Ctrl-C
-        typer.secho("Interrupted: nothing was written.", fg=typer.colors.YELLOW, err=True)
+        is_kept = not _KEEPING.isdisjoint(sys.argv[1:2])
+        left = "what there is of the survey was kept" if is_kept else "nothing was written"
+        typer.secho(f"Interrupted: {left}.", fg=typer.colors.YELLOW, err=True)
     sys.exit(code or 0)
 
 

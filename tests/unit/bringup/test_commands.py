@@ -55,19 +55,31 @@ def test_shells_complete_commands_and_values(
     assert capsys.readouterr().out.split() == expected
 
 
-def test_after_ctrl_c_it_says_that_nothing_was_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("words", "function", "left"),
+    [
+        (["detect", "a.ply", "--boq", "b.yaml"], "detect_cloud.detect_file", "nothing was written"),
+        (["patrol", "a.yaml"], "patrol.conduct.conduct", "what there is of the survey was kept"),
+        (
+            ["simulate-patrol", "a.mcap", "--boq", "b.yaml"],
+            "simulated_patrol.simulate_patrol",
+            "what there is of the survey was kept",
+        ),
+    ],
+)
+def test_after_ctrl_c_it_says_what_was_written(
+    words: list[str], function: str, left: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeprog_bringup.detect_cloud.detect_file", interrupted)
+    monkeypatch.setattr(f"pipeprog_bringup.{function}", interrupted)
     monkeypatch.setattr("signal.signal", lambda *_: None)
-    monkeypatch.setattr(sys, "argv", ["pipeprog", "detect", "a.ply", "--boq", "b.yaml", "--out", "out"])
+    monkeypatch.setattr(sys, "argv", ["pipeprog", *words, "--out", "out"])
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 130
-    assert capsys.readouterr().err.endswith("Interrupted: nothing was written.\n")
+    assert capsys.readouterr().err.endswith(f"Interrupted: {left}.\n")
 
 
 def test_a_file_gets_a_line_for_each_stage_and_one_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
