@@ -96,7 +96,8 @@ class SurveyNode(LifecycleNode):
         left, self._left = self._left, None
         if left is not None and self._running is None:
             request = deserialize_message(left.goal, Survey.Goal)
-            self.executor.create_task(self._run, Client(request.survey_id, None), request, left.folder)
+            self._running = Client(request.survey_id, None)  # a goal of this name that comes now is of its client
+            self.executor.create_task(self._run, self._running, request, left.folder)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -184,7 +185,7 @@ class SurveyNode(LifecycleNode):
 
     async def _run(self, client: Client, request: Survey.Goal, left: Path | None = None) -> Survey.Result:
         """The result of a survey from its beginning, or from where a process that was killed has `left` it."""
-        self._running, self._end_asked = client, False
+        self._running, self._end_asked = client, not self._is_active  # it may have been deactivated meanwhile
         started = time.monotonic()
         try:
             result = await self._conducted(client, request, left)

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from action_msgs.msg import GoalStatus
 from lifecycle_msgs.msg import Transition
+from rclpy.action import GoalResponse
+from rclpy.serialization import serialize_message
 from rclpy.task import Future
 
 from pipeprog_bringup.survey import node as survey_node
@@ -70,6 +72,19 @@ def test_an_exception_in_a_transition_leads_to_the_state_unconfigured(
     assert surveys.state == "unconfigured"
     surveys.activate()
     assert surveys.state == "active"
+
+
+def test_a_goal_that_comes_before_a_survey_goes_on_is_of_its_client(
+    surveys: SurveyStage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = Unfinished(tmp_path / "monday" / ".pipeprog-1", serialize_message(Survey.Goal(survey_id="monday")))
+    monkeypatch.setattr(surveys.node, "_left", left)
+    with monkeypatch.context() as waiting:  # the survey has not begun yet
+        waiting.setattr(surveys.node.executor, "create_task", lambda *_: None)
+        surveys.node.trigger_configure()
+        surveys.node.trigger_activate()
+    assert surveys.node._on_goal(Survey.Goal(survey_id="tuesday")) == GoalResponse.REJECT
+    assert surveys.node._on_goal(Survey.Goal(survey_id="monday")) == GoalResponse.ACCEPT
 
 
 def test_a_goal_in_a_damaged_journal_leaves_the_node_unconfigured_and_not_active(
