@@ -75,7 +75,7 @@ def compared(seed: int) -> list[dict[str, Any]]:
         ids = [None if true[key] is None else found[k].get(true[key]) for k, key in enumerate(("first", "second"))]
         life = lives.get(ids[0]) if ids[0] else None
         row = next((r for r in told if (life and r["id"] == life) or (ids[1] and ids[1] in r["ids"])), None)
-        grown = None if row is None or true["state"] != "longer" else row["after_m"] - row["before_m"] - true["grown"]
+        grown = None if row is None or true["state"] != "longer" else row["grown_m"] - true["grown"]
         rows.append(
             {
                 "site": nights[0].name,

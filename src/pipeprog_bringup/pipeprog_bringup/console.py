@@ -197,11 +197,11 @@ def print_steps(steps: Sequence[Step]) -> None:
         table = Table(title=f"{_name(step.earlier)} to {_name(step.later)}", title_justify="left")
         for name in ("pipe", "class", "state"):
             table.add_column(name)
-        for name in ("before [m]", "now [m]", "counts [m]"):
+        for name in ("before [m]", "now [m]", "grown by [m]", "counts [m]"):
             table.add_column(name, justify="right")
         for each in step.pipes:
             change = each.change
-            lengths = (change.length_before, change.length_after, change.counted)
+            lengths = (change.length_before, change.length_after, change.grown, change.counted)
             state = change.state.replace("_", " ")
             table.add_row(
                 each.life, _name(change.class_name or "no planned class"), state, *(f"{m:.2f}" for m in lengths)

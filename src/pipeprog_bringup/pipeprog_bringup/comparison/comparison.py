@@ -124,6 +124,7 @@ def as_json(steps: Sequence[Step]) -> list[dict[str, Any]]:
                     "before_m": round(each.change.length_before, 3),
                     "after_m": round(each.change.length_after, 3),
                     "counted_m": round(each.change.counted, 3),
+                    "grown_m": round(each.change.grown, 3),
                 }
                 for each in step.pipes
             ],

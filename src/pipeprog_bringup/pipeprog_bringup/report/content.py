@@ -156,7 +156,7 @@ def _last_step(surveys: Sequence[Survey]) -> tuple[Step | None, str]:
 def change_words(change: Change) -> str:
     """What became of a pipe, in words."""
     if change.state in ("longer", "shorter"):
-        return f"{change.state} by {abs(change.counted - change.length_before):.2f} m"
+        return f"{'longer' if change.grown > 0.0 else 'shorter'} by {abs(change.grown):.2f} m"
     return {"not_seen": "not seen this time", "gone": "gone, its place was seen", "kept": "as before"}.get(
         change.state, change.state
     )

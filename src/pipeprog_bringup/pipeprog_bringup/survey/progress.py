@@ -30,6 +30,7 @@ def site_progress(earlier: Path, later: Path, header: Header) -> SiteProgress:
                 length_before=each.change.length_before,
                 length_after=each.change.length_after,
                 counted=each.change.counted,
+                grown=each.change.grown,
             )
             for each in step.pipes
         ],

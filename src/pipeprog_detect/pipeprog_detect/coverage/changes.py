@@ -46,6 +46,8 @@ class Change:
         length_before, length_after: of these together [m].
         counted: metres that count as installed now: what is measured, and of what was there before all that nobody has
             seen to be gone.
+        grown: metres by which it has become longer or, negative, shorter at those of its ends that have moved by more
+            than their standard deviations: an end that is hidden in both surveys is measured elsewhere in each.
     """
 
     state: str
@@ -55,6 +57,7 @@ class Change:
     length_before: float
     length_after: float
     counted: float
+    grown: float
 
 
 def changes(before: Sequence[KnownPipe], after: Sequence[KnownPipe], views: Sequence[View]) -> list[Change]:
@@ -70,7 +73,8 @@ def changes(before: Sequence[KnownPipe], after: Sequence[KnownPipe], views: Sequ
         if shared and max(shared) > 0.0:
             pieces.setdefault(int(np.argmax(shared)), []).append(number)
         else:
-            new.append(Change("new", pipe.class_name, (), (pipe.id,), 0.0, pipe.cylinder.length, pipe.cylinder.length))
+            length = pipe.cylinder.length
+            new.append(Change("new", pipe.class_name, (), (pipe.id,), 0.0, length, counted=length, grown=length))
     coverage = axis_coverage([pipe.cylinder for pipe in before], views)
     known = [
         _known(old, [after[piece] for piece in pieces.get(number, [])], own)
@@ -100,22 +104,24 @@ def _known(old: KnownPipe, pieces: Sequence[KnownPipe], own: AxisCoverage) -> Ch
     if not pieces:
         gone = own.metres(Sight.EMPTY) > 0.5 * length
         counted = 0.0 if gone else length
-        return Change("gone" if gone else "not_seen", old.class_name, (old.id,), ids, length, now, counted)
+        state = "gone" if gone else "not_seen"
+        return Change(state, old.class_name, (old.id,), ids, length, now, counted, counted - length)
     is_shorter = is_longer = False
-    counted = now
+    counted, grown = now, 0.0
     stretches = _open_stretches(old, pieces)
     for number, stretch in enumerate(stretches):
         beyond = (own.positions() > stretch.low) & (own.positions() < stretch.high)
         vanished = own.metres(Sight.EMPTY, within=beyond)
         unseen = own.metres(*Sight, within=beyond) - vanished
         least = SIGMAS * float(np.linalg.norm(stretch.sigmas)) + STEP
-        is_shorter |= vanished > least
-        is_outer = number in (0, len(stretches) - 1)
-        is_longer |= is_outer and stretch.low - stretch.high > least
+        if vanished > least:
+            is_shorter, grown = True, grown - (stretch.high - stretch.low - unseen)
+        elif number in (0, len(stretches) - 1) and stretch.low - stretch.high > least:
+            is_longer, grown = True, grown + stretch.low - stretch.high
         # Of a stretch that nobody has seen to be gone, the survey tells that knows the end better.
         counted += unseen if unseen > SIGMAS * min(stretch.sigmas) + STEP else 0.0
     state = "shorter" if is_shorter else "longer" if is_longer else "kept"
-    return Change(state, old.class_name, (old.id,), ids, length, now, counted)
+    return Change(state, old.class_name, (old.id,), ids, length, now, counted, grown)
 
 
 @dataclass(frozen=True)

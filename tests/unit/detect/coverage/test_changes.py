@@ -51,6 +51,22 @@ def test_two_stages_of_a_site(views: list[View]) -> None:
     assert counted["gone"] == 0.0
     assert counted["hidden"] == pytest.approx(0.8), "nobody has seen it to be gone"
     assert counted["shorter"] == pytest.approx(0.5)
+    grown = {(each.before or each.after)[0]: each.grown for each in told}
+    assert grown["gone"] == pytest.approx(-0.8)
+    assert grown["added"] == pytest.approx(0.8)
+    assert grown["longer"] == pytest.approx(0.3)
+    assert grown["shorter"] == pytest.approx(-0.3, abs=0.03), "it is looked at every two centimetres"
+    assert [grown[name] for name in ("kept", "hidden", "out of view")] == [0.0, 0.0, 0.0]
+
+
+def test_a_hidden_end_that_is_measured_elsewhere_has_not_grown(views: list[View]) -> None:
+    whole = upright(-0.3)
+    before = KnownPipe("old", whole.cut(0.06, 0.5), "DN", (0.03, 0.002))
+    after = KnownPipe("new", whole, "DN", (0.03, 0.002))
+    (told,) = changes([before], [after], views)
+    assert told.state == "longer"
+    assert told.length_after - told.length_before == pytest.approx(0.36)
+    assert told.grown == pytest.approx(0.3)
 
 
 def test_a_neighbour_of_another_class_or_direction_is_another_pipe(views: list[View]) -> None:
