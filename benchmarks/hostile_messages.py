@@ -34,6 +34,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
+from std_msgs.msg import Bool
 
 from benchmarks.recordings import DEMO, ROOT
 from benchmarks.survey import RESULTS, commit
@@ -48,6 +49,7 @@ PATIENCE = 300.0  # s for what takes seconds on an idle machine
 ACKNOWLEDGED = 5.0  # s that an acknowledgement may take; the middleware gives up some damaged bytes without one
 BETWEEN_WAITS = 20  # messages on each topic between two waits for the nodes to have worked them off
 PAUSE = 0.02  # s after a message on each topic: a node takes some milliseconds for its own
+PAUSED = "survey/paused"  # a topic on which no message is invalid: it is switched on and off
 IN_FLIGHT = 10  # frames of the recording that are sent and not decided on
 FROM_OUTSIDE = ("camera_info", "image/compressed", "image", "odometry", "imu", "/tf", "/tf_static")
 WITH_WORKERS = ("sfm", "detect")
@@ -131,7 +133,7 @@ class Peer:
         self._publishers = {
             topic: self.node.create_publisher(type(message), topic, qos.kept(10))
             for topic, message in good_messages(0).items()
-        }
+        } | {PAUSED: self.node.create_publisher(Bool, PAUSED, qos.kept(10))}
         subscribe = self.node.create_subscription
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         subscribe(msg.FrameDecision, "frame_decisions", self._on_decision, qos.reliable(1000))
@@ -222,12 +224,14 @@ def attack(peer: Peer, count: int, seed: int) -> dict[str, Any]:
             fuzzed = next(stream)
             kinds[fuzzed.kind] += 1
             peer.publish(topic, fuzzed.content)
+        peer.publish(PAUSED, Bool(data=number % 2 == 0))
         peer.pause()
         if number % BETWEEN_WAITS == BETWEEN_WAITS - 1:
             peer.settle()
         if number % 100 == 99:
             print(f"{number + 1} of {count} on each of {len(streams)} topics", flush=True)
             _ = peer.graph.without_worker  # notes the workers that are there
+    peer.publish(PAUSED, Bool())
     peer.spin(2.0)  # two diagnostics
     peer.wait_for(lambda: not peer.graph.without_worker)
     return {
