@@ -26,9 +26,10 @@ from rclpy.client import Client
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
-from benchmarks.live_graph import MODULES, PATIENCE, LiveGraph, Robot, demo_frames
+from benchmarks.live_graph import PATIENCE, LiveGraph, Robot, demo_frames
 from benchmarks.survey import RESULTS, commit
 from pipeprog_bringup.playback.private_network import private_network
+from pipeprog_bringup.simulated_patrol import MODULES
 from pipeprog_msgs.msg import FrameDecision
 from pipeprog_node import messages
 

@@ -23,7 +23,7 @@ from pipeprog_bringup.results.atomic_output import OutputFolder
 from pipeprog_bringup.results.nothing_found import why_nothing_was_found
 from pipeprog_bringup.results.plan_file import write_plan
 from pipeprog_bringup.results.plan_place import why_no_place_is_planned
-from pipeprog_bringup.results.setting_overrides import as_parameters, effective
+from pipeprog_bringup.results.setting_overrides import as_parameters, effective, given_names
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.product import Product
@@ -148,9 +148,9 @@ def _read(request: Request) -> _Inputs:
     board_file = load_board_file(request.board) if request.board else BoardFile()
     if request.rate is not None and not request.rate > 0:
         raise InputError(f"--rate {request.rate:g}: give a factor above zero, 1 for real time")
-    if "frames.lockstep" in _names(request):
+    if "frames.lockstep" in given_names(request.overrides):
         raise InputError("--set frames.lockstep: a replay is always in lockstep, or it would lose frames")
-    configs = effective([*told_by(bag, _names(request)), *request.overrides])
+    configs = effective([*told_by(bag, given_names(request.overrides)), *request.overrides])
     configs["frames"] = dataclasses.replace(configs["frames"], lockstep=True)
     return _Inputs(bag, boq, board_file, configs, read_map(request.reference / MAP_FILE) if request.reference else None)
 
@@ -163,11 +163,6 @@ def told_by(bag: Bag, given: set[str]) -> list[str]:
     if bag.focal_sigma is not None:
         told |= {FOCAL_SIGMA: bag.focal_sigma, "sfm.calibration.distortion_sigma": GUESSED_DISTORTION}
     return [f"{name}={value!r}" for name, value in told.items() if name not in given]
-
-
-def _names(request: Request) -> set[str]:
-    """The settings that the user has given."""
-    return {text.partition("=")[0].strip() for text in request.overrides}
 
 
 def _parameters(request: Request, configs: dict[str, Any], colmap: Path) -> dict[str, dict[str, Any]]:

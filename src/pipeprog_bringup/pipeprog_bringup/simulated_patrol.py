@@ -22,7 +22,7 @@ from pipeprog_bringup.playback.scratch import check_room, scratch_folder
 from pipeprog_bringup.playback.simulated_robot import SimulatedRobot, camera_names
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_bringup.replay import told_by
-from pipeprog_bringup.results.setting_overrides import as_parameters, effective
+from pipeprog_bringup.results.setting_overrides import as_parameters, effective, given_names
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_boq
 from pipeprog_msgs.action import Survey
@@ -94,8 +94,8 @@ def _read(request: Request) -> list[Bag]:
 
 def _parameters(request: Request, bag: Bag) -> dict[str, dict[str, Any]]:
     """The ROS parameters of each node."""
-    given = {text.partition("=")[0].strip() for text in request.overrides}
-    parameters = as_parameters(effective([*told_by(bag, given), *request.overrides]))
+    told = told_by(bag, given_names(request.overrides))
+    parameters = as_parameters(effective([*told, *request.overrides]))
     cameras = " ".join(camera_names(len(bag.rig)))
     parameters["frames"] |= {"idle": True, "cameras": cameras}
     parameters["detect"] |= {"boq": str(request.boq.resolve())}

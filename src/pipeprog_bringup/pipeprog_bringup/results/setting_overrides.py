@@ -36,6 +36,11 @@ def effective(texts: Sequence[str], nodes: Sequence[str] = tuple(NODE_CONFIGS)) 
     return {node: build(NODE_CONFIGS[node], values[node]) for node in nodes}
 
 
+def given_names(texts: Sequence[str]) -> set[str]:
+    """The settings that `node.param=value` texts give."""
+    return {text.partition("=")[0].strip() for text in texts}
+
+
 def as_parameters(configs: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The configurations as flat parameter names and values per node."""
     return {node: flatten(config) for node, config in configs.items()}

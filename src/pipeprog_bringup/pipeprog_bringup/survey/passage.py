@@ -82,7 +82,8 @@ class Passage:
         self._paused = node.create_publisher(Bool, "survey/paused", qos.latched())
         self._begun: dict[str, dict[str, Any]] = {}  # how each node has begun this survey: fields of Renew
         space = node.get_namespace().strip("/")
-        self._names = {f"{space}/{name}".strip("/"): name for name in CONFIGS}  # by how diagnostics call them
+        self._full_names = {name: f"{space}/{name}".strip("/") for name in CONFIGS}  # as diagnostics call them
+        self._names = {full_name: name for name, full_name in self._full_names.items()}
         self._lives = dict.fromkeys(CONFIGS, 0)  # times that each has taken it up
         self._map_asked: int | None = None  # keyframes of the map that has been made; None: not yet
 
@@ -194,8 +195,7 @@ class Passage:
 
     def _is_there(self, name: str) -> bool:
         """Whether a node can be asked to begin: its death over that must be noticed."""
-        full_name = next(full for full, short in self._names.items() if short == name)
-        return self._renew[name].service_is_ready() and self._watchdog.knows(full_name)
+        return self._renew[name].service_is_ready() and self._watchdog.knows(self._full_names[name])
 
     async def _finished(self, name: str, expected: int) -> srv.Finish.Response:
         client: Client = self._finish[name]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map that may hold so many keyframes and no more: they become fewer first, and none is chosen at the limit."""
+"""The limit to the keyframes of a map: fewer are chosen from half of it on, and none at it."""
 
 from __future__ import annotations
 
