@@ -193,7 +193,8 @@ class ConductedSurvey:
             self._looked = now
             self._journal.live()
             self._look_for_input(now)
-            self._is_full = self._is_full or not self._output.has_room
+            if not self._journal.progress.is_filmed and not self._stopped:  # later the folder may be gone
+                self._is_full = self._is_full or not self._output.has_room
         await self._wait()
 
     def _look_for_input(self, now: float) -> None:

@@ -12,8 +12,8 @@ import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
 
+from pipeprog_bringup.survey import conducted_survey, survey_output
 from pipeprog_bringup.survey import node as survey_node
-from pipeprog_bringup.survey import survey_output
 from pipeprog_bringup.survey.survey_output import MIN_FREE
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import SiteProgress
@@ -66,6 +66,30 @@ def test_filming_ends_early_where_the_disk_gets_full_and_keeps_what_was_measured
     assert "make room" in answer.result.error_msg
     assert [pipe.id for pipe in answer.result.pipes.pipes] == ["p01"]
     assert (Path(answer.result.folder) / "pipes.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("is_cancelled", "status", "code"),
+    [
+        (True, GoalStatus.STATUS_CANCELED, Survey.Result.NONE),
+        (False, GoalStatus.STATUS_ABORTED, Survey.Result.NO_IMAGES),
+    ],
+)
+def test_a_survey_without_an_image_is_answered_though_its_folder_is_gone(
+    surveys: SurveyStage, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_cancelled: bool, status: int, code: int
+) -> None:
+    monkeypatch.setattr(conducted_survey, "ROOM_PERIOD", 0.0)  # s: whenever it waits, for the nodes' rest, too
+    surveys.activate()
+    handle = surveys.film(survey_id="nothing")
+    if is_cancelled:
+        surveys.cancel(handle)
+    else:
+        surveys.let_finish(keyframes=0, revision=0)
+        surveys.end()
+    answer = surveys.result(handle)
+    assert (answer.status, answer.result.error_code) == (status, code)
+    assert answer.result.folder == ""
+    assert not (tmp_path / "surveys" / "nothing").exists()
 
 
 def test_filming_ends_after_its_time_limit(surveys: SurveyStage) -> None:
