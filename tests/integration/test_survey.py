@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import random
 import signal
 import subprocess
 import sys
@@ -33,6 +34,7 @@ from pipeprog_msgs.msg import FrameDecision, SiteProgress
 from pipeprog_node import messages, qos
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
 from tests.access import Access, allowed, used
+from tests.fuzz.absurd_goals import absurd_goal, is_named
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG, BOQ, BOARD = (BAGS / f"demo.{end}" for end in ("mcap", "boq.yaml", "board.yaml"))
@@ -88,7 +90,7 @@ class Mission:
     def change(self, transition: int) -> bool:
         return bool(self.call(self.state, ChangeState.Request(transition=Transition(id=transition))).success)
 
-    def send(self, **goal: str) -> Any:
+    def send(self, **goal: Any) -> Any:
         """The handle of a goal; the robot stands at the beginning of its walk."""
         self.feedback.clear()
         self._place = 0
@@ -174,22 +176,27 @@ class Nodes:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start_all(self, parameters: dict[str, dict[str, Any]], arguments: Sequence[str] = ()) -> None:
-        """Each node in an enclave of its own, with `arguments` of ROS for all of them."""
-        for name, module in MODULES.items():
+        """The nodes with `parameters`, each in an enclave of its own, with `arguments` of ROS for all of them."""
+        for name, values in parameters.items():
             file = self.folder.parent / f"{name}.yaml"
-            file.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": parameters[name]}}))
+            file.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": values}}))
             words = ["-r", f"__node:={name}", "--params-file", str(file), "--enclave", f"/pipeprog/{name}", *arguments]
-            self.start(name, [sys.executable, "-m", module, "--ros-args", *words])
+            self.start(name, [sys.executable, "-m", MODULES[name], "--ros-args", *words])
 
     def start(self, name: str, command: list[str]) -> None:
         self._commands[name] = command
-        self._processes[name] = subprocess.Popen(command)
+        self._processes[name] = subprocess.Popen(command, cwd=self.folder.parent)
 
     def kill_and_start_again(self, name: str, how: int = signal.SIGKILL) -> None:
         """As a launch file does with what dies."""
         self._processes[name].send_signal(how)
         self._processes[name].wait()
         self.start(name, self._commands[name])
+
+    @property
+    def are_running(self) -> bool:
+        """Whether all that were started run still."""
+        return all(process.poll() is None for process in self._processes.values())
 
     def close(self) -> None:
         for process in self._processes.values():
@@ -220,6 +227,17 @@ def nodes(robot: Nodes) -> Nodes:
 
 def names(folder: Path) -> set[str]:
     return {str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()}
+
+
+def sendable_goals(count: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Absurd goals as a message holds them: a text ends before its first zero, a duration is made of integers."""
+    rng = random.Random(seed)
+    while count:
+        goal = absurd_goal(rng)
+        texts = [value for value in goal.values() if isinstance(value, str)]
+        if abs(goal["time_limit"]) < 2**31 and not any("\0" in text for text in texts):
+            yield goal
+            count -= 1
 
 
 def unlike_the_policy(mission: Mission, names: GraphNames) -> tuple[set[Access], set[Access]]:
@@ -356,3 +374,19 @@ def test_a_policy_allows_what_the_nodes_of_a_robot_with_two_cameras_use(mission:
     mission.wait_for(lambda: mission.feedback and mission.feedback[-1].state == Survey.Feedback.FILMING)
     velocities = ("/pipeprog/sfm", "/robot7/sfm", "publish", "/robot7/keyframe_velocities")
     assert unlike_the_policy(mission, names) == (set(), {velocities})
+
+
+def test_a_hundred_absurd_goals_are_refused_and_write_nothing(mission: Mission, robot: Nodes) -> None:
+    robot.start_all({"survey": {"boq": str(BOQ), "board": str(BOARD), "results": str(robot.folder)}})
+    mission.meet()
+    assert mission.change(Transition.TRANSITION_CONFIGURE)
+    assert mission.change(Transition.TRANSITION_ACTIVATE)
+    before = names(robot.folder.parent)
+    for goal in sendable_goals(100, seed=19):
+        limit = messages.duration_msg(goal["time_limit"])
+        answer = mission.result(mission.send(**{**goal, "time_limit": limit}))
+        assert (answer.status, answer.result.error_code) == (GoalStatus.STATUS_ABORTED, Survey.Result.BAD_INPUT)
+        assert is_named(goal, answer.result.error_msg), answer.result.error_msg
+        assert answer.result.folder == ""
+    assert names(robot.folder.parent) == before
+    assert robot.are_running

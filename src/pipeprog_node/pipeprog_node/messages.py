@@ -63,7 +63,7 @@ def time_msg(stamp: int) -> Time:
 
 
 def duration_msg(seconds: float) -> Duration:
-    """A duration [s], not negative."""
+    """A duration [s]."""
     nanoseconds = round(1e9 * seconds)
     return Duration(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
