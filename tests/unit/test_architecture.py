@@ -42,10 +42,11 @@ GLUE = {
         *{"header", "images", "keyframes", "maps", "motion"},  # the room received
         "renewal",
         "retirement_input",
+        "ros_context",
         "worker",
     },
     "pipeprog_bringup": {
-        *{"session", "connections", "player", "listener", "survey_writer", "outline_marker", "ros_context"},
+        *{"session", "connections", "player", "listener", "survey_writer", "outline_marker"},
         *{"simulated_robot", "simulated_patrol"},
         *{"node", "conducted_survey", "passage", "map_listener", "robot_input", "survey_output", "missing_input"},
         *{"survey_client", "conduct", "alignment_result", "waiting_client", "progress", "takeover"},

@@ -11,7 +11,6 @@ from typing import Any
 
 from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph
 from pipeprog_bringup.playback.private_network import private_network
-from pipeprog_bringup.playback.ros_context import ros_context
 from pipeprog_bringup.playback.scratch import check_room, scratch_folder
 from pipeprog_bringup.playback.session import Session, State
 from pipeprog_bringup.playback.survey_writer import record_keyframes, record_survey, seen_by, write_survey
@@ -28,6 +27,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import BillOfQuantities, load_boq
 from pipeprog_detect.product.product import Product
 from pipeprog_node.messages import points_from_cloud
+from pipeprog_node.ros_context import ros_context
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
 from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file

@@ -17,7 +17,6 @@ from pipeprog_bringup.patrol.round import Surveyed
 from pipeprog_bringup.patrol.survey_client import SurveyClient
 from pipeprog_bringup.playback.node_processes import NODE_MODULES, Graph, NodeFailure
 from pipeprog_bringup.playback.private_network import private_network
-from pipeprog_bringup.playback.ros_context import ros_context
 from pipeprog_bringup.playback.scratch import check_room, scratch_folder
 from pipeprog_bringup.playback.simulated_robot import SimulatedRobot, camera_names
 from pipeprog_bringup.recording.bag import Bag
@@ -26,6 +25,7 @@ from pipeprog_bringup.results.setting_overrides import as_parameters, effective,
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.product.boq import load_boq
 from pipeprog_msgs.action import Survey
+from pipeprog_node.ros_context import ros_context
 from pipeprog_sfm.boards.board_file import load_board_file
 
 MODULES = NODE_MODULES | {"survey": "pipeprog_bringup.survey.node"}

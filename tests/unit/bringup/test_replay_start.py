@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a replay says where ROS does not start, and the settings that it takes from its recording."""
+"""The settings that a replay takes from its recording."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from pipeprog_bringup import replay
-from pipeprog_bringup.playback.ros_context import ros_context
 from pipeprog_bringup.recording import cdr
 from pipeprog_bringup.recording.bag import readout_key
 from pipeprog_bringup.recording.bag_writer import BagWriter
@@ -16,12 +15,6 @@ from pipeprog_camera.errors import InputError
 from tests.unit.bringup.recordings import START, image, info
 
 BOQ = Path(__file__).parents[3] / "bags" / "demo.boq.yaml"
-
-
-def test_a_domain_that_is_none_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
-    with pytest.raises(InputError, match=r"ROS_DOMAIN_ID is not an integral number; look at"), ros_context():
-        pass
 
 
 def recording(path: Path, readout: str) -> Path:

@@ -6,12 +6,10 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
-import rclpy
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from pipeprog_bringup.patrol.patrol_file import read_patrol
 from pipeprog_bringup.patrol.patrol_state import PatrolState
@@ -20,6 +18,7 @@ from pipeprog_bringup.patrol.survey_client import SurveyClient
 from pipeprog_bringup.results.folder_lock import locked
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import shown
+from pipeprog_node.ros_context import ros_context
 
 STATE = "patrol.json"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,15}")  # with a place's 40 letters and a number, a survey's 64
@@ -44,15 +43,8 @@ def conduct(patrol_file: Path, out: Path, report: Callable[[str], None]) -> list
         raise InputError(f"another patrol is under way in {out}: wait for it, or choose another --out") from None
     try:
         state = PatrolState(out / STATE, [place.name for place in patrol.places])
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        try:
-            client = SurveyClient(Node("patrol"))
-            try:
-                return Round(patrol, state, name, client, report).run()
-            finally:
-                client.close()
-        finally:
-            rclpy.try_shutdown()
+        with ros_context(), closing(SurveyClient(Node("patrol"))) as client:
+            return Round(patrol, state, name, client, report).run()
     finally:
         with suppress(OSError):
             os.close(lock)
