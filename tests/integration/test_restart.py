@@ -27,7 +27,7 @@ from tf2_msgs.msg import TFMessage
 from pipeprog_camera.camera import Camera
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
-from pipeprog_node.supervision import MAX_VAIN_DEATHS
+from pipeprog_node.processes.supervision import MAX_VAIN_DEATHS
 
 TIMEOUT = 150.0  # s: the first start compiles
 WIDTH, HEIGHT = 480, 320

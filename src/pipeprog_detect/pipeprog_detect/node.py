@@ -46,22 +46,22 @@ from pipeprog_detect.worker import (
 )
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
-from pipeprog_node.cores import limit_cores
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
-from pipeprog_node.journal import Journal, journal_of
 from pipeprog_node.keyframe_input import IMAGES, REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
+from pipeprog_node.processes.cores import limit_cores
+from pipeprog_node.processes.journal import Journal, journal_of
+from pipeprog_node.processes.supervision import Supervision
+from pipeprog_node.processes.worker import WorkerProcess
 from pipeprog_node.received import images as received_images
 from pipeprog_node.received import maps as received_maps
 from pipeprog_node.received.images import ReceivedCamera
 from pipeprog_node.received.keyframes import ReceivedRetirement
 from pipeprog_node.received.maps import ReceivedCloud, ReceivedPoses, ReceivedStatus, ReceivedVelocities
 from pipeprog_node.retirement_input import RetirementInput
-from pipeprog_node.supervision import Supervision
-from pipeprog_node.worker import WorkerProcess
 
 POINTS, POSES, VELOCITIES = "map_points", "keyframe_poses", "keyframe_velocities"
 MAP_PARTS = (ReceivedStatus, ReceivedPoses, ReceivedCloud)

@@ -32,14 +32,14 @@ from pipeprog_frames.rig_selection import ONE, RigSelection
 from pipeprog_frames.selection import Selected
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
 from pipeprog_node import messages, qos
-from pipeprog_node.cores import limit_cores
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.discovery import stages_subscribed
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake
-from pipeprog_node.journal import Journal, journal_of
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
+from pipeprog_node.processes.cores import limit_cores
+from pipeprog_node.processes.journal import Journal, journal_of
 from pipeprog_node.received import images as received_images
 from pipeprog_node.received import keyframes as received_keyframes
 

@@ -31,20 +31,20 @@ from pipeprog_camera.limits import (
 from pipeprog_msgs import msg
 from pipeprog_node import messages, qos
 from pipeprog_node.camera_transforms import FRAME, CameraTransforms
-from pipeprog_node.cores import limit_cores
 from pipeprog_node.diagnostics import Diagnostics
 from pipeprog_node.finish import FinishService
 from pipeprog_node.intake import Intake, InvalidMessageError
-from pipeprog_node.journal import Journal, journal_of
 from pipeprog_node.keyframe_input import REFINED_CALIBRATION, KeyframeInput
 from pipeprog_node.main import run
 from pipeprog_node.parameters import declare, declare_fixed
+from pipeprog_node.processes.cores import limit_cores
+from pipeprog_node.processes.journal import Journal, journal_of
+from pipeprog_node.processes.supervision import Supervision
+from pipeprog_node.processes.worker import WorkerProcess
 from pipeprog_node.received import motion as received_motion
 from pipeprog_node.received.keyframes import ReceivedRetirement
 from pipeprog_node.received.motion import ReceivedAcceleration, ReceivedTransform, ReceivedTransforms
 from pipeprog_node.retirement_input import RetirementInput
-from pipeprog_node.supervision import Supervision
-from pipeprog_node.worker import WorkerProcess
 from pipeprog_sfm.alignment.map_file import read_map
 from pipeprog_sfm.boards.board_file import BoardFile, load_board_file
 from pipeprog_sfm.config import SfmConfig

@@ -27,7 +27,7 @@ from pipeprog_frames.node import KEPT, FramesNode
 from pipeprog_msgs.msg import FrameDecision, ImageOverlap, ImageOverlapArray, KeyframesRetired
 from pipeprog_msgs.srv import Finish
 from pipeprog_node import messages, qos
-from pipeprog_node.journal import Journal
+from pipeprog_node.processes.journal import Journal
 from tests.fuzz.fuzzed_messages import png_header
 
 CAMERA = Camera(640, 360, 450.0, 450.0, 319.5, 179.5)

@@ -10,7 +10,7 @@ import pytest
 import rclpy
 
 from pipeprog_camera.camera import Camera
-from pipeprog_node.supervision import MAX_VAIN_DEATHS
+from pipeprog_node.processes.supervision import MAX_VAIN_DEATHS
 from pipeprog_sfm import node as sfm
 from pipeprog_sfm.reconstruction import Status
 from pipeprog_sfm.worker import AddKeyframe, Finish, KeyframeDone, Ready, Retire

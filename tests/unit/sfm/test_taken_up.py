@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from pipeprog_camera.camera import Camera
 from pipeprog_msgs.msg import ImageOverlapArray, KeyframesRetired
 from pipeprog_node import messages, qos
-from pipeprog_node.journal import Journal
+from pipeprog_node.processes.journal import Journal
 from pipeprog_sfm import node as sfm
 from pipeprog_sfm.reconstruction import Status
 from pipeprog_sfm.worker import AddKeyframe, KeyframeDone, Ready, Retire, Retired

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_frames.frame_decision import FAULTS, FULL
-from pipeprog_node.journal import Journal
+from pipeprog_node.processes.journal import Journal
 
 LOST_AFTER = 3  # keyframes in a row without a place in the map: one may be blurred, two may be its neighbours
 

@@ -11,7 +11,7 @@ from typing import Any
 from pipeprog_bringup.results.atomic_output import JOURNAL, left_behind
 from pipeprog_bringup.survey.sign_of_life import is_alive, sign
 from pipeprog_camera.errors import InputError
-from pipeprog_node.journal import Journal
+from pipeprog_node.processes.journal import Journal
 
 _NAME = "survey.journal"
 _LIFE = "survey.alive"  # the node's signs of life, beside its journal

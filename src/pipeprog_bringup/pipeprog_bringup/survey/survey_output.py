@@ -31,7 +31,7 @@ from pipeprog_camera.errors import InputError
 from pipeprog_frames.incoming.frame_buffer import EncodedFrame
 from pipeprog_msgs import msg
 from pipeprog_node import messages
-from pipeprog_node.journal import written
+from pipeprog_node.processes.journal import written
 from pipeprog_sfm.alignment.map_file import MAP_FILE
 
 MIN_FREE = 1 << 30  # bytes; 1 GiB: the results of a field of 58 pipes take 0.4 GB, cloud and keyframes included

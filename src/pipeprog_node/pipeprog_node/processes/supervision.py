@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
-from pipeprog_node.journal import Journal, Record
+from pipeprog_node.processes.journal import Journal, Record
 
 MAX_VAIN_DEATHS = 4  # in a row without an answer: two commands in a row that each kill two workers
 MAX_DEATHS = 10  # within REST_SECONDS: a start a minute, each of which costs seconds, leaves time to work
@@ -33,7 +33,7 @@ class Command(Protocol):
 
 
 class Worker(Protocol):
-    """What supervision needs of a process, as pipeprog_node.worker.WorkerProcess."""
+    """What supervision needs of a process, as pipeprog_node.processes.worker.WorkerProcess."""
 
     def send(self, command: Any) -> None:
         """Queues a command; never blocks."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-BOQ = Path(__file__).parents[3] / "bags" / "demo.boq.yaml"
+BOQ = Path(__file__).parents[4] / "bags" / "demo.boq.yaml"
 # Prints how many workers the node has, and the cores of each of their threads and of its own.
 PROGRAM = """
 import json, multiprocessing, os, sys

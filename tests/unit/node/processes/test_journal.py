@@ -11,7 +11,7 @@ from typing import IO
 import pytest
 
 from pipeprog_camera.errors import InputError
-from pipeprog_node.journal import Journal
+from pipeprog_node.processes.journal import Journal
 
 READ = "import pickle, sys; print(list(pickle.loads(bytes.fromhex(sys.argv[1]))))"
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeprog_node.journal import Journal
-from pipeprog_node.supervision import MAX_DEATHS, MAX_VAIN_DEATHS, REST_SECONDS, Supervision
+from pipeprog_node.processes.journal import Journal
+from pipeprog_node.processes.supervision import MAX_DEATHS, MAX_VAIN_DEATHS, REST_SECONDS, Supervision
 
 
 @dataclass(frozen=True)
