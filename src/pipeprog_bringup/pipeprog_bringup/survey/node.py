@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import time
+import traceback
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -189,6 +190,10 @@ class SurveyNode(LifecycleNode):
         started = time.monotonic()
         try:
             result = await self._conducted(client, request, left)
+        except Exception as error:  # a fault of this program: its client hears of it, and the next survey can begin
+            self.get_logger().error(traceback.format_exc())
+            text = f"a fault of pipeprog has ended the survey: {type(error).__name__}: {error}"
+            result = Survey.Result(error_code=Survey.Result.UNKNOWN, error_msg=text)
         finally:
             self._running = None
         gc.collect()  # its node and messages hold each other in circles, which Python looks for by counts of objects

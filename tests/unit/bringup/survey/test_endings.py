@@ -92,6 +92,21 @@ def test_a_survey_without_an_image_is_answered_though_its_folder_is_gone(
     assert not (tmp_path / "surveys" / "nothing").exists()
 
 
+def test_a_fault_of_the_program_is_told_and_the_next_survey_can_begin(
+    surveys: SurveyStage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise ZeroDivisionError("nothing to divide by")
+
+    surveys.activate()
+    with monkeypatch.context() as during:
+        during.setattr(conducted_survey, "advice", fails)
+        answer = surveys.result(surveys.send(survey_id="faulty"))
+    assert (answer.status, answer.result.error_code) == (GoalStatus.STATUS_ABORTED, Survey.Result.UNKNOWN)
+    assert "ZeroDivisionError: nothing to divide by" in answer.result.error_msg
+    surveys.cancel(surveys.film(survey_id="next"))
+
+
 def test_filming_ends_after_its_time_limit(surveys: SurveyStage) -> None:
     surveys.activate()
     surveys.let_finish(keyframes=1, revision=1)
