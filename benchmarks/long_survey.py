@@ -142,7 +142,7 @@ def main() -> None:
             "pipes": [pipe.class_name for pipe in answer.result.pipes.pipes],
             "error code": int(answer.result.error_code),
             f"growth of memory from minute {WARM} on, a minute [%]": round(growth(robot.rows), 2),
-            "slowest answer of a node [s]": round(max(robot.slowest.values()), 2),
+            **{f"slowest answer of {name} [s]": round(value, 2) for name, value in robot.slowest.items()},
         },
         "rows": robot.rows,
     }
