@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud.octree import THREADS
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, contour_samples
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
 from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line
@@ -66,7 +66,7 @@ def pair_views(
         edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
     # Most of the time is OpenCV's line segments, which leave the interpreter to the other threads.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         seen = pool.map(lambda view: _pair_view(view, points, radii, known, edges), _apart(views, points))
         return [each for each in seen if each is not None]
 
