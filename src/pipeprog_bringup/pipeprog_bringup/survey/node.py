@@ -191,9 +191,7 @@ class SurveyNode(LifecycleNode):
         try:
             result = await self._conducted(client, request, left)
         except Exception as error:  # a fault of this program: its client hears of it, and the next survey can begin
-            self.get_logger().error(traceback.format_exc())
-            text = f"a fault of pipeprog has ended the survey: {type(error).__name__}: {error}"
-            result = Survey.Result(error_code=Survey.Result.UNKNOWN, error_msg=text)
+            result = self._of_fault(error)
         finally:
             self._running = None
         gc.collect()  # its node and messages hold each other in circles, which Python looks for by counts of objects
@@ -233,6 +231,9 @@ class SurveyNode(LifecycleNode):
                 keep=self._takeover.keep,
             )
             result = await self._survey.run()
+        except Exception as error:  # what was filmed is kept, and the name is free for a later process
+            result = self._of_fault(error)
+            result.folder = output.rescue()
         finally:
             self._survey = None
             journal.close()
@@ -244,6 +245,12 @@ class SurveyNode(LifecycleNode):
             folders = goal.reference.path.parent, Path(result.folder)
             self.executor.create_task(self._publish_progress, *folders, result.pipes.header)
         return result
+
+    def _of_fault(self, error: Exception) -> Survey.Result:
+        """The result of a survey that a fault of this program ends, while it is handled."""
+        self.get_logger().error(traceback.format_exc())
+        text = f"a fault of pipeprog has ended the survey: {type(error).__name__}: {error}"
+        return Survey.Result(error_code=Survey.Result.UNKNOWN, error_msg=text)
 
     async def _publish_progress(self, earlier: Path, later: Path, header: Header) -> None:
         """Tells what has changed since the reference: it takes seconds, for which no result waits."""

@@ -130,6 +130,17 @@ class SurveyOutput:
         """Gives the files their names."""
         self._open.close()
 
+    def rescue(self) -> str:
+        """Ends with the recordings alone, where a fault ends the survey: the folder, empty where nothing was filmed."""
+        if not self._images:
+            self.discard()
+            return ""
+        for name in self._folder.names():
+            if not name.endswith(".mcap"):  # it may be half written
+                self._folder.file(name).unlink()
+        self.publish()
+        return str(self.path.resolve())
+
     def discard(self) -> None:
         """Ends without results."""
         with contextlib.suppress(_DiscardedError), self._open:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
+from mcap.reader import make_reader
 
 from pipeprog_bringup.survey import conducted_survey, survey_output
 from pipeprog_bringup.survey import node as survey_node
@@ -104,7 +105,26 @@ def test_a_fault_of_the_program_is_told_and_the_next_survey_can_begin(
         answer = surveys.result(surveys.send(survey_id="faulty"))
     assert (answer.status, answer.result.error_code) == (GoalStatus.STATUS_ABORTED, Survey.Result.UNKNOWN)
     assert "ZeroDivisionError: nothing to divide by" in answer.result.error_msg
-    surveys.cancel(surveys.film(survey_id="next"))
+    surveys.cancel(surveys.film(survey_id="faulty"))  # the name is free again: nothing was filmed
+
+
+def test_a_fault_of_the_program_keeps_what_was_filmed(surveys: SurveyStage, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(path: Path, *_: object) -> None:
+        path.write_text("half of a table")
+        raise ZeroDivisionError("nothing to divide by")
+
+    surveys.activate()
+    handle = surveys.film_a_map(survey_id="faulty")
+    surveys.let_finish(keyframes=1, revision=1)
+    monkeypatch.setattr(survey_output.result_files, "write_config", fails)
+    surveys.end()
+    answer = surveys.result(handle)
+    assert (answer.status, answer.result.error_code) == (GoalStatus.STATUS_ABORTED, Survey.Result.UNKNOWN)
+    folder = Path(answer.result.folder)
+    assert [file.name for file in folder.iterdir()] == ["out.mcap"]
+    with (folder / "out.mcap").open("rb") as stream:
+        topics = {channel.topic for _, channel, _ in make_reader(stream).iter_messages()}
+    assert "/keyframes/image/compressed" in topics
 
 
 def test_filming_ends_after_its_time_limit(surveys: SurveyStage) -> None:
