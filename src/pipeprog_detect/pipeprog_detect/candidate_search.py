@@ -19,8 +19,8 @@ from pipeprog_detect.cloud.candidate import Candidate, fit_candidate, own_points
 from pipeprog_detect.cloud.collinear import elbows, join, near, spanning
 from pipeprog_detect.cloud.cutting_planes import CuttingPlane, place_planes, section_hypotheses
 from pipeprog_detect.cloud.local_shape import Surfaces
-from pipeprog_detect.cloud.octree import THREADS, Octree
-from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.cloud.octree import Octree
+from pipeprog_detect.config import THREADS, DetectConfig
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.scene_context import SceneContext

@@ -11,7 +11,8 @@ import numpy as np
 from numba import njit
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_detect.cloud.octree import THREADS, Octree, neighbour_ranges
+from pipeprog_detect.cloud.octree import Octree, neighbour_ranges
+from pipeprog_detect.config import THREADS
 
 # A quadric has six coefficients: twice as many points leave something to judge it by.
 _LEAST_POINTS = 12

@@ -7,7 +7,6 @@ of the order in which the points came.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,8 +15,6 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 
-# For loops over independent parts; what they give does not depend on it. Linux alone tells the cores of a process.
-THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
 # Cells [m] by which points near a segment are looked up: about as wide as a pipe, so that few cells lie near one and
 # few of their points do not. The nearest level of the tree is taken.
 _LOOKUP_CELL = 0.0625

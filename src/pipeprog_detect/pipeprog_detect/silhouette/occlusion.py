@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.octree import THREADS
+from pipeprog_detect.config import THREADS
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ContourSamples, parts_by_view
 from pipeprog_detect.types import Cylinder, View
 

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.octree import THREADS
+from pipeprog_detect.config import THREADS
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, contour_samples
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
 from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.cylinder_fit import basis
-from pipeprog_detect.cloud.octree import THREADS
+from pipeprog_detect.config import THREADS
 from pipeprog_detect.silhouette.apparent_contour import contour_samples, parts_by_view
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
 from pipeprog_detect.silhouette.scene import SPACING
