@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.axial_evidence import STEP_AT
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.edge_support import COMMON
@@ -28,6 +29,9 @@ ONE_STEP = 1.0 / 8.0
 # beside the step if it goes on in the direction of the step: twice the share then. A pipe mostly differs from what lies
 # on both sides in the same direction.
 ONE_STAIR = 2.0 * ONE_STEP
+# A coarse texture steps as well. A step that is an edge of a pipe is more than this many times what the texture right
+# beside it steps by: both are means over few stretches, and such means of one texture differ by a half.
+AS_TEXTURE = 2.0
 # Positions of the contour's samples over which texture averages out while what is behind a pipe stays the same.
 STRETCH = 20
 # Spacing of the samples along which texture is compared [px], and number of samples (100 px) whose mean follows what is
@@ -98,18 +102,29 @@ def is_one_step(scene: Scene) -> bool:
     if support.weaker_share >= CONVINCING:
         return False
     samples = scene.samples()
-    light = scene.light(samples, STEP_AT, SPACING)
     if not np.bincount(samples.side, minlength=2).all():
         return False
-    # A pipe that goes on before something else may turn from darker to brighter: each stretch has steps of its own.
+    steps = _steps(scene, samples, 0.0)
+    size = np.abs(steps).sum(axis=0)
+    weaker, stronger = np.argsort(size)
+    texture = AS_TEXTURE * np.abs(_steps(scene, samples, BESIDE_EDGE)).sum(axis=0)[weaker]
+    if steps.sum(axis=0).prod() < 0.0:
+        return bool(size[weaker] < max(ONE_STAIR * size[stronger], texture))
+    is_one = size[weaker] < max(ONE_STEP * size[stronger], texture)
+    return bool(is_one and support.log_odds().sum(axis=0).min() < DECISIVE)
+
+
+def _steps(scene: Scene, samples: ContourSamples, beside: float) -> FloatArray:
+    """The mean step of the light `beside` the contour [px], outwards, of each stretch and side (S, 2).
+
+    A pipe that goes on before something else may turn from darker to brighter: each stretch has steps of its own. They
+    add up to those of a side.
+    """
+    light = scene.light(samples, STEP_AT + beside, SPACING)
     stretch = samples.positions()[1] // STRETCH
     cell, count = 2 * stretch + samples.side, 2 * (int(stretch.max()) + 1)
-    number = np.bincount(cell, minlength=count).reshape(-1, 2)
-    steps = np.bincount(cell, light[:, 0] - light[:, 1], count).reshape(-1, 2)
-    weaker, stronger = sorted(np.abs(steps).sum(axis=0) / number.sum(axis=0))
-    if steps.sum(axis=0).prod() < 0.0:
-        return bool(weaker < ONE_STAIR * stronger)
-    return bool(weaker < ONE_STEP * stronger and support.log_odds().sum(axis=0).min() < DECISIVE)
+    sums = np.bincount(cell, light[:, 0] - light[:, 1], count).reshape(-1, 2)
+    return np.asarray(sums / np.bincount(samples.side, minlength=2), np.float64)
 
 
 def is_strip_of_light(scene: Scene) -> bool:

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import contour_samples
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.scene import Scene
@@ -31,17 +33,35 @@ def test_the_edge_of_a_shadow_is_one_step(radius: float, side: float, empty_view
     assert is_false_line(line, None, wall_points().astype(np.float32), [], empty_views, [])
 
 
-@pytest.mark.parametrize(("beyond", "is_step"), [(-4.0, True), (-8.0, False), (4.0, False)])
-def test_light_that_goes_on_beside_a_step_is_the_steps(
-    beyond: float, is_step: bool, empty_views: list[View], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("beyond", "texture", "is_step"),
+    [
+        *((-4.0, 0.0, True), (-8.0, 0.0, False), (4.0, 0.0, False)),
+        *((4.0, 1.0, False), (4.0, 3.0, True), (-8.0, 3.0, False), (-8.0, 5.0, True)),
+    ],
+)
+def test_light_that_goes_on_beside_a_step_is_the_steps_or_the_textures(
+    beyond: float, texture: float, is_step: bool, empty_views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside a step of 24 grey levels the light changes by 4 in its direction, by 8, and by 4 against it."""
+    """Beside a step of 24 grey levels the light changes by 4 in its direction, by 8, and by 4 against it.
+
+    Right beside that the texture changes it.
+    """
     line = Cylinder(np.array([SHADOW, WALL, -0.2]), np.array([SHADOW, WALL, 0.2]), 0.0086)
     scene = Scene.of(line, empty_views, [])
-    samples = scene.samples()
-    inwards = np.where(samples.side == 0, 24.0, beyond)
-    monkeypatch.setattr(Scene, "light", lambda *_: np.column_stack([inwards, np.zeros(len(inwards))]))
+    inwards = np.where(scene.samples().side == 0, 24.0, beyond)
+    monkeypatch.setattr(Scene, "light", stepping(inwards, texture))
     assert is_one_step(scene) is is_step
+
+
+def stepping(inwards: FloatArray, texture: float) -> Callable[..., FloatArray]:
+    """Stands for `Scene.light`: steps (N,) at the contour, one of texture beside it."""
+
+    def light(_: Scene, samples: object, offsets: FloatArray, lines: int) -> FloatArray:
+        step = inwards if offsets[0] < 0.0 else np.full(len(inwards), texture)
+        return np.column_stack([step, np.zeros(len(inwards))])
+
+    return light
 
 
 def test_a_pipe_is_none(pipe_views: list[View]) -> None:
@@ -74,7 +94,7 @@ def test_a_pipe_that_turns_from_darker_to_brighter_than_what_is_behind_it_has_tw
     inwards = np.where(samples.side == 0, 24.0, behind)
     monkeypatch.setattr(Scene, "samples", lambda *_, **__: samples)
     monkeypatch.setattr(Scene, "support", lambda *_: NoSupport())
-    monkeypatch.setattr(Scene, "light", lambda *_: np.column_stack([inwards, np.zeros(len(inwards))]))
+    monkeypatch.setattr(Scene, "light", stepping(inwards, 0.0))
     assert not is_one_step(scene)
 
 
