@@ -17,7 +17,7 @@ from pipeprog_detect.silhouette.one_sided import SeenArc, with_radius
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question
-from pipeprog_detect.verification.radius_agreement import excludes, is_resolved
+from pipeprog_detect.verification.radius_agreement import allows, is_resolved
 
 # Support that makes a pipe: those that exist show edges along more than half of their visible contour.
 CONVINCING = 0.5
@@ -86,8 +86,8 @@ class CandidateFitter:
 
         A shadow along a pipe is taken for its contour where the cameras never rise or fall. Pipes of sizes that nobody
         planned are rarer than shadows, but where the planned size finds no contour of its own the fit stands. The one
-        side that is seen of a pipe does not tell its radius either. The radii that the cloud does not exclude are tried
-        in the order in which the fit and the cloud together allow them.
+        side that is seen of a pipe does not tell its radius either. Of the radii that the cloud allows those are tried
+        first that agree best with the fit and the cloud together.
         """
         if fit is None or (
             any(_has_size(fit, planned) for planned in self._radii()) and fit.radius_sigma < TOLD * fit.cylinder.radius
@@ -102,7 +102,7 @@ class CandidateFitter:
 
         for planned in sorted(self._radii(), key=misfit):
             is_near = abs(planned / radius - 1.0) < NEAR_PLANNED
-            if is_near and not excludes(candidate, planned, MANUFACTURE * planned):
+            if is_near and allows(candidate, planned, MANUFACTURE * planned):
                 again = _at_radius(fit.cylinder, planned, abs(planned - radius), views, others)
                 if again is None:
                     at_fit = replace(candidate, cylinder=fit.cylinder)

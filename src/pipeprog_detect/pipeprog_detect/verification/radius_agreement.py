@@ -47,3 +47,12 @@ def excludes(candidate: Candidate, radius: float, radius_sigma: float) -> bool:
     """Whether a cloud that resolves the section cannot have a radius [m], known to `radius_sigma` [m]."""
     sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, radius_sigma])
     return is_resolved(candidate) and bool(abs(radius - candidate.cylinder.radius) > CONTRADICTION * sigma)
+
+
+def allows(candidate: Candidate, radius: float, radius_sigma: float) -> bool:
+    """Whether a pipe of a radius [m], known to `radius_sigma` [m], may look to the cloud like the candidate.
+
+    Stereo makes a small arc too flat, never too narrow: the pipe may be thinner.
+    """
+    is_flatter = candidate.evidence.arc < RESOLVED_ARC and radius < candidate.cylinder.radius
+    return is_flatter or not excludes(candidate, radius, radius_sigma)

@@ -189,6 +189,28 @@ def test_a_planned_radius_that_the_cloud_excludes_is_not_taken(
     assert taken is (other if is_tried else own)
 
 
+@pytest.mark.parametrize(
+    ("arc", "planned", "is_taken"), [(85.0, 0.0365, True), (125.0, 0.0365, False), (85.0, 0.0549, False)]
+)
+def test_a_small_arc_does_not_exclude_thinner_radii(
+    monkeypatch: pytest.MonkeyPatch, arc: float, planned: float, is_taken: bool
+) -> None:
+    """A pipe of which a tray hides one side: stereo makes what is left of it too flat, by 6 of its sigmas."""
+    evidence = CloudEvidence(np.radians(arc), 0.9, 0.0, 0.001, 0.0, 20.0)
+    flat = Candidate(replace(PIPE, radius=0.0457), 0.00153, 20_000, evidence)
+    between = replace(PIPE, radius=planned + 0.07 * (0.0457 - planned))
+    own, one_side = (
+        ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 3e-4, support, 90.0, 20, (0.0, 0.0), 0.0, 0.5)
+        for cylinder, support in ((between, 0.5), (replace(PIPE, radius=planned), 0.53))
+    )
+    monkeypatch.setattr(candidate_fit, "_at_radius", lambda *_: None)
+    monkeypatch.setattr(candidate_fit, "_with_surface", lambda *_: one_side.cylinder)
+    monkeypatch.setattr(candidate_fit, "_of_one_side", lambda *_: one_side)
+    fitter = CandidateFitter(_boq(planned), MeasurementCache())
+    taken = fitter.near_planned(flat, replace(own, radius_sigma=0.01), [], [looking_along_y(0.0, 0)])
+    assert (taken is one_side) is is_taken
+
+
 @pytest.mark.parametrize(("arc", "support", "stands"), [(115.0, 0.6, True), (115.0, 0.4, False), (125.0, 0.4, True)])
 def test_of_a_pipe_in_a_rack_one_side_suffices(
     monkeypatch: pytest.MonkeyPatch, arc: float, support: float, stands: bool
