@@ -103,20 +103,26 @@ def at_cloud_depth(
 
 
 def is_edge_of_face(
-    cylinder: Cylinder, points: NDArray[np.float32], views: Sequence[View], walls: Sequence[Plane]
+    cylinder: Cylinder,
+    points: NDArray[np.float32],
+    views: Sequence[View],
+    walls: Sequence[Plane],
+    others: Sequence[Cylinder],
 ) -> bool:
     """Whether a face whose edge it is goes on beside it: a tray's, a duct's or a board's.
 
     Seen from the mean centre of the views, the cloud's points (N, 3) then lie as far away beside it, on one side, as
     where it is, and on the other side farther away by its diameter at least. What the cloud shows there may be nearer
     than it, since lines tell the depth of an edge badly, but not behind it. One of the `walls`, seen aslant, is farther
-    away on one side as well; it has no edge where it goes on.
+    away on one side as well; it has no edge where it goes on. The barrels of the `others` are no faces.
     """
     centre = mean_centre(cylinder, views)
     if centre is None:
         return False
     depth, radius = float((cylinder.start - centre) @ _sight(cylinder, centre)[1]), cylinder.radius
     bins, cell, aside, far, rows = _beside(cylinder, points, centre)
+    own = ~_are_on(others, points[rows], radius)
+    cell, aside, far, rows = cell[own], aside[own], far[own], rows[own]
 
     def level(least: float, most: float, values: NDArray[np.floating] = far) -> FloatArray:
         there = (aside > least * radius) & (aside < most * radius)
@@ -136,6 +142,18 @@ def is_edge_of_face(
         if told.sum() > SHOWN * bins and (told & flush_there & open_there).sum() > 0.5 * told.sum():
             return True
     return False
+
+
+def _are_on(cylinders: Sequence[Cylinder], points: NDArray[np.float32], clearance: float) -> NDArray[np.bool_]:
+    """Which of the points (N, 3) lie within a cylinder, or no more than `clearance` [m] beside its surface."""
+    on = np.zeros(len(points), bool)
+    for each in cylinders:
+        low = np.minimum(each.start, each.end) - each.radius - clearance
+        high = np.maximum(each.start, each.end) + each.radius + clearance
+        near = np.flatnonzero(((points > low) & (points < high)).all(axis=1) & ~on)
+        along = each.along(points[near])
+        on[near] = (along > 0.0) & (along < each.length) & (each.surface_distance(points[near]) < clearance)
+    return on
 
 
 def _beside(

@@ -71,7 +71,7 @@ def is_false_line(
         return True
     if fit is not None and fit.is_round:
         return False
-    return is_edge_of_face(cylinder, points, views, walls) or is_strip_of_light(scene)
+    return is_edge_of_face(cylinder, points, views, walls, others) or is_strip_of_light(scene)
 
 
 def is_bare(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray) -> bool:

@@ -70,7 +70,7 @@ def test_a_line_with_a_face_on_one_side_is_that_faces_edge(
         [rng.uniform(-0.35, 0.35, len(height)), deeper + rng.normal(0.0, 2e-3, len(height)), height], axis=1
     )
     points = points[np.isfinite(points).all(axis=1)].astype(np.float32)
-    assert is_edge_of_face(line, points, pipe_views, []) == edge
+    assert is_edge_of_face(line, points, pipe_views, [], []) == edge
 
 
 def test_a_wall_that_is_seen_aslant_has_no_edge_behind_a_pipe(pipe_views: list[View]) -> None:
@@ -86,10 +86,20 @@ def test_a_wall_that_is_seen_aslant_has_no_edge_behind_a_pipe(pipe_views: list[V
 
     def edge(nearer: FloatArray) -> bool:
         cloud = np.stack([along, 0.022 + slope * height - nearer + noise, height], axis=1).astype(np.float32)
-        return is_edge_of_face(line, cloud, pipe_views, [wall])
+        return is_edge_of_face(line, cloud, pipe_views, [wall], [])
 
     assert not edge(np.where(np.abs(height) < 0.009, 0.008, 0.0))
     assert edge(np.where(height < 0.009, 0.015, 0.0))
+
+
+def test_the_barrel_of_a_neighbour_is_no_face(pipe_views: list[View]) -> None:
+    """A thin pipe runs 57 mm beside a DN100 at the depth of its front, before nothing."""
+    line = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    neighbour = Cylinder(np.array([-0.35, 0.04, -0.1]), np.array([0.35, 0.04, -0.1]), 0.0575)
+    on_line = front_points(line)[::4]
+    points = np.concatenate([front_points(neighbour), on_line]).astype(np.float32)
+    assert is_edge_of_face(line, points, pipe_views, [], [])
+    assert not is_edge_of_face(line, points, pipe_views, [], [neighbour])
 
 
 def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:
