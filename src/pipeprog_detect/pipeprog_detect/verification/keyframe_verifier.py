@@ -162,12 +162,12 @@ class KeyframeVerifier:
         if candidate.blurred or not trusted:
             # Where noise hides the section only the planned radii tell a thin pipe from the edge of a plate; where an
             # elbow is part of it they tell a stub.
-            if fit is None or not self._fitter.is_planned(fit):
-                fit = self._fitter.of_planned_radius(candidate, others, self._views)
-            elif self._fitter.strays(candidate, fit):
+            if fit is not None and self._fitter.is_planned(fit) and self._fitter.strays(candidate, fit):
                 fit = self._fitter.of_planned_radius(candidate, others, self._views) or fit
             else:
                 fit = self._fitter.near_planned(candidate, fit, others, self._views)
+                if fit is None or not self._fitter.is_planned(fit):
+                    fit = self._fitter.of_planned_radius(candidate, others, self._views)
             if fit is None or (candidate.blurred and is_stub(fit.cylinder)):
                 return None
             if (candidate.blurred or candidate.radius_held) and not self._shows_both_sides(fit.cylinder, others):

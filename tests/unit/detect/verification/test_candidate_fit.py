@@ -282,3 +282,26 @@ def test_a_fit_out_of_the_candidates_reach_gives_way_to_a_planned_one(monkeypatc
     camera = looking_along_y(0.0, 0)
     measured = KeyframeVerifier([camera], boq).measure([rough], [False])
     assert [each.cylinder.radius for each in measured] == [own.cylinder.radius]
+
+
+@pytest.mark.parametrize("is_near", [True, False])
+def test_a_planned_radius_is_tried_near_the_contour_of_one_that_is_none(
+    monkeypatch: pytest.MonkeyPatch, is_near: bool
+) -> None:
+    """A DN65 in a cable tray: to the cloud, which has the tray as well, it is 10 mm too thick, more than 3 sigma."""
+    evidence = CloudEvidence(np.radians(125.0), 0.98, 0.0, 0.0019, 0.0, 11.0)
+    rough = Candidate(replace(PIPE, radius=0.0471), 0.0032, 9000, evidence)
+    free, planned = (
+        ContourFit(replace(PIPE, radius=radius), np.eye(3)[1:], np.eye(5), 2e-4, 1.0, odds, 11, (0.0, 0.0), 0.0, 0.5)
+        for radius, odds in ((0.0389, 157.0), (0.0365, 169.0))
+    )
+
+    def at_radius(cylinder: Cylinder, *_: object) -> ContourFit | None:
+        return planned if is_near and cylinder is free.cylinder else None
+
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: free)
+    monkeypatch.setattr(candidate_fit, "_at_radius", at_radius)
+    monkeypatch.setattr(candidate_fit, "_of_one_side", lambda *_: None)
+    monkeypatch.setattr(candidate_fit, "_with_surface", lambda *_: free.cylinder)
+    measured = KeyframeVerifier([looking_along_y(0.0, 0)], _boq(0.0365)).measure([rough], [False])
+    assert [each.fit for each in measured] == [planned] * is_near
