@@ -165,6 +165,7 @@ def detect_outside(
         return not is_one_step(Scene.of(each.cylinder, judging, others))
 
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
+    measured = _judged(measured, judging, is_supported)  # what is dropped in the end hides no whole pipe now
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(points, around, THICKEST_LINE, measured, judging, boq, edges)

@@ -21,7 +21,7 @@ from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable
 from pipeprog_detect.verification.scene_context import SceneContext
-from tests.unit.detect.pipe_and_wall import PIPE
+from tests.unit.detect.pipe_and_wall import PIPE, wall_points
 
 CONFIG = DetectConfig()
 NOISE = 2e-3
@@ -188,6 +188,29 @@ def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View],
     assert judged(measured, pipe_views) == measured[:1]
     assert judged(measured[:1], empty_views) == measured[:1]  # thick: the cloud shows it
     assert judged(measured, []) == measured
+
+
+def test_a_line_that_is_dropped_in_the_end_hides_no_thin_pipe_before(
+    empty_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A piece of a pipe that does not stand for itself must not be known where the whole pipe is sought."""
+    piece = replace(PIPE.shifted(np.array([0.12, 0.0, 0.0])), radius=0.0086)
+    evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
+    measured = MeasuredPipe.of_cloud(Candidate(piece, 1e-3, 100, evidence))
+    known: list[list[MeasuredPipe]] = []
+
+    def finds_none(
+        points: FloatArray, around: SceneContext, thickest: float, found: list[MeasuredPipe], *_: object
+    ) -> list[MeasuredPipe]:
+        known.append(list(found))
+        return []
+
+    monkeypatch.setattr(detector.KeyframeVerifier, "measure", lambda *_: [measured])
+    monkeypatch.setattr(detector, "_genuine", lambda pipes, *_: pipes)
+    monkeypatch.setattr(detector, "is_false_line", lambda *_: False)
+    monkeypatch.setattr(detector, "find_thin_pipes", finds_none)
+    assert detect(Cloud(wall_points()), BOQ, CONFIG, empty_views) == []
+    assert known == [[]]
 
 
 def test_the_blur_of_the_views_is_that_of_thick_pipes(pipe_views: list[View]) -> None:
