@@ -137,7 +137,7 @@ class SurveyOutput:
             return ""
         for name in self._folder.names():
             if not name.endswith(".mcap"):  # it may be half written
-                self._folder.file(name).unlink()
+                self._folder.file(name).unlink(missing_ok=True)
         self.publish()
         return str(self.path.resolve())
 
