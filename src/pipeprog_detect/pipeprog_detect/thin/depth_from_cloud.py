@@ -121,7 +121,8 @@ def is_edge_of_face(
         return False
     depth, radius = float((cylinder.start - centre) @ _sight(cylinder, centre)[1]), cylinder.radius
     bins, cell, aside, far, rows = _beside(cylinder, points, centre)
-    own = ~_are_on(others, points[rows], radius)
+    own = np.flatnonzero(np.abs(aside) < FACE[1] * radius)
+    own = own[~_are_on(others, points[rows[own]], radius)]
     cell, aside, far, rows = cell[own], aside[own], far[own], rows[own]
 
     def level(least: float, most: float, values: NDArray[np.floating] = far) -> FloatArray:
