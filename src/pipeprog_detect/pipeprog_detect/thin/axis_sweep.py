@@ -328,6 +328,21 @@ def _best_run(gains: FloatArray) -> tuple[float, int, int]:
 
 
 @njit(cache=True, nogil=True)
+def _width_of_peak(distances: FloatArray, scores: FloatArray) -> float:
+    """The range [m] of distances (D,) about the best one whose scores (D,) are more than half of its.
+
+    An edge counts within a row, so that its own error may as well move the peak as far as it is wide.
+    """
+    first = last = scores.argmax()
+    half = 0.5 * scores[first]
+    while first > 0 and scores[first - 1] > half:
+        first -= 1
+    while last < len(scores) - 1 and scores[last + 1] > half:
+        last += 1
+    return abs(distances[last] - distances[first])
+
+
+@njit(cache=True, nogil=True)
 def _at_best_depth(
     lines: FloatArray,
     place: FloatArray,
@@ -362,7 +377,8 @@ def _at_best_depth(
         away = distances[scores.argmax()]
         likely = distances[scores > scores.max() - DECISIVE]
         # Half of the range is two standard deviations; the next step might be as good.
-        sigma = 0.25 * (likely.max() - likely.min()) + 0.5 * _inverse_step(place[v, 4]) * away**2
+        widest = max(likely.max() - likely.min(), _width_of_peak(distances, scores))
+        sigma = 0.25 * widest + 0.5 * _inverse_step(place[v, 4]) * away**2
         x, y = place[v, 0] + away * across, place[v, 1] + away * up
         low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
         at = (x, y, low, STRETCH)

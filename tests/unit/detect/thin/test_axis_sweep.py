@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_detect.silhouette.apparent_contour import contour_samples
-from pipeprog_detect.thin.axis_sweep import Proposal, propose_parallel
+from pipeprog_detect.thin.axis_sweep import Proposal, _width_of_peak, propose_parallel
 from pipeprog_detect.thin.parallel_directions import LEAST_PARALLEL, parallel_directions
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.straight_ahead import looking_along_y
@@ -87,6 +87,16 @@ def test_views_from_one_height_leave_the_depth_to_the_width() -> None:
     best = propose(walk((0.5,), [PIPE]))[0]
     assert best.depth_sigma > RADIUS
     assert aside(best, PIPE) < 3.0 * best.depth_sigma
+
+
+def test_a_peak_is_as_wide_as_at_half_of_its_height() -> None:
+    """Other depths beyond a gap, as good as they may be, are no part of it."""
+    distances = np.linspace(2.0, 1.0, 101)
+    peak = np.maximum(100.0 - 1000.0 * np.abs(distances - 1.5), -5.0)
+    assert _width_of_peak(distances, peak) == pytest.approx(0.1, abs=0.021)
+    peak[distances < 1.2] = 99.0
+    assert _width_of_peak(distances, peak) == pytest.approx(0.1, abs=0.021)
+    assert _width_of_peak(distances, np.ones(101)) == 1.0
 
 
 @pytest.mark.parametrize("apart", [4.5 * RADIUS, 0.12])
