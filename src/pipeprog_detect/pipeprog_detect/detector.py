@@ -29,7 +29,7 @@ from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.grown_ends import with_grown_ends
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, joined, own_contours
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, is_stub, joined, own_contours
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.open_ends import with_open_ends
 from pipeprog_detect.verification.parallel_to_wall import parallel_to_wall
@@ -165,7 +165,10 @@ def detect_outside(
         return not is_one_step(Scene.of(each.cylinder, judging, others))
 
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
-    measured = _judged(measured, judging, is_supported)  # what is dropped in the end hides no whole pipe now
+    # What is dropped in the end hides no whole pipe now, nor does a stub of one.
+    measured = _judged(
+        measured, judging, lambda each, others: not is_stub(each.cylinder) and is_supported(each, others)
+    )
     report(0.95, "looking for thin pipes in the keyframes")
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(points, around, THICKEST_LINE, measured, judging, boq, edges)

@@ -190,11 +190,12 @@ def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View],
     assert judged(measured, []) == measured
 
 
+@pytest.mark.parametrize(("length", "is_seen"), [(0.4, False), (0.16, True)])
 def test_a_line_that_is_dropped_in_the_end_hides_no_thin_pipe_before(
-    empty_views: list[View], monkeypatch: pytest.MonkeyPatch
+    empty_views: list[View], monkeypatch: pytest.MonkeyPatch, length: float, is_seen: bool
 ) -> None:
-    """A piece of a pipe that does not stand for itself must not be known where the whole pipe is sought."""
-    piece = replace(PIPE.shifted(np.array([0.12, 0.0, 0.0])), radius=0.0086)
+    """A piece of a pipe that does not stand for itself, or a stub, must not be known where the whole one is sought."""
+    piece = replace(PIPE.cut(0.0, length).shifted(np.array([0.12, 0.0, 0.0])), radius=0.0086)
     evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
     measured = MeasuredPipe.of_cloud(Candidate(piece, 1e-3, 100, evidence))
     known: list[list[MeasuredPipe]] = []
@@ -209,6 +210,7 @@ def test_a_line_that_is_dropped_in_the_end_hides_no_thin_pipe_before(
     monkeypatch.setattr(detector, "_genuine", lambda pipes, *_: pipes)
     monkeypatch.setattr(detector, "is_false_line", lambda *_: False)
     monkeypatch.setattr(detector, "find_thin_pipes", finds_none)
+    monkeypatch.setattr(detector, "is_probable", lambda *_: is_seen)
     assert detect(Cloud(wall_points()), BOQ, CONFIG, empty_views) == []
     assert known == [[]]
 
