@@ -24,7 +24,7 @@ from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.false_lines import is_false_line, is_one_step
 from pipeprog_detect.thin.hangers import is_hanger
-from pipeprog_detect.thin.thin_pipes import find_thin_pipes, turned_parallel
+from pipeprog_detect.thin.thin_pipes import find_thin_pipes, in_colour, turned_parallel
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.grown_ends import with_grown_ends
@@ -159,10 +159,11 @@ def detect_outside(
         return not is_false_line(each.cylinder, each.fit, points, around.planes, judging, others)
 
     def is_supported(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
-        return is_probable(each.cylinder, judging, others)
+        return any(is_probable(each.cylinder, shown, others) for shown in (judging, in_colour(judging)) if shown)
 
     def has_two_edges(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
-        return not is_one_step(Scene.of(each.cylinder, judging, others))
+        both = (judging, in_colour(judging))
+        return not all(is_one_step(Scene.of(each.cylinder, shown, others)) for shown in both if shown)
 
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
     # What is dropped in the end hides no whole pipe now, nor does a stub of one.

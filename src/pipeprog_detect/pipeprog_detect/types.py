@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,7 +29,8 @@ class View:
     Pixels are those of the stamp, at which a camera with a rolling shutter exposes its middle row: `rolled` tells where
     the image shows them, None: there. `nearest` (h, w) float32, where it is known: depth [m] of what the cloud shows in
     each of h x w equal cells. `blur`, where it is known: that of the image by lens, pixel and motion together, as a
-    standard deviation [px].
+    standard deviation [px]. `chromaticity` (H, W) uint8: the colour of the pixels without their
+    brightness (`red_against_blue`); None where they have none.
     """
 
     stamp: int
@@ -39,12 +40,17 @@ class View:
     nearest: NDArray[np.float32] | None = None
     rolled: RolledImage | None = None
     blur: float | None = None
+    chromaticity: NDArray[np.uint8] | None = None
 
     @cached_property
     def centre(self) -> FloatArray:
         """The projection centre (3,) in the map frame [m]."""
         rotation = self.camera_from_map[:3, :3]
         return -rotation.T @ self.camera_from_map[:3, 3]
+
+    def in_colour(self) -> View | None:
+        """The view with its colour in place of grey, how blurred is not known; None where it has no colour."""
+        return None if self.chromaticity is None else replace(self, image=self.chromaticity, blur=None)
 
     def shown(self, pixels: FloatArray, depths: FloatArray) -> FloatArray:
         """Where the image shows (N, 2) what lies at pixels (N, 2) at depths (N,) [m]."""

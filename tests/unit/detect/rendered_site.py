@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeprog_camera.camera import Camera
+from pipeprog_detect.chromaticity import red_against_blue
 from pipeprog_detect.types import View
 from sitegen.primitives import Primitive, rectangle
 from sitegen.render import Lamp, Lens, build_scene, render
@@ -37,5 +38,6 @@ def walk_past(things: Sequence[Primitive], count: int = 10) -> list[View]:
         linear = render(scene, LENS, np.repeat(pose[None], LENS.height, 0))
         image = develop(linear, Sensor(), np.random.default_rng(index))
         grey = np.ascontiguousarray(image[:, :, 1])
-        views.append(View(index, grey, camera, np.linalg.inv(pose)))
+        chromaticity = red_against_blue(image)
+        views.append(View(index, grey, camera, np.linalg.inv(pose), chromaticity=chromaticity))
     return views

@@ -10,7 +10,7 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.axial_evidence import FARTHEST, TOLERANCE, AxialEvidence, axial_evidence
 from pipeprog_detect.silhouette.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
-from pipeprog_detect.silhouette.edge_support import support_profile
+from pipeprog_detect.silhouette.edge_support import SupportProfile, support_profile
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene
@@ -87,7 +87,7 @@ def without_bend(known: AdjustedCylinder, start: Cylinder, prior: FloatArray) ->
         cylinder = known.cylinder
         if cylinder.length > WITH_BEND * cylinder.radius or known.share > HALF_SEEN:
             break
-        scene = replace(known.scene, cylinder=_where_seen(known))
+        scene = replace(known.scene, cylinder=where_seen(cylinder, support_profile(known.samples, known.hit)))
         if scene.cylinder.length < LEAST_STUB * cylinder.radius:
             break
         shorter = adjusted(scene, prior, _step_from(start, scene))
@@ -97,18 +97,17 @@ def without_bend(known: AdjustedCylinder, start: Cylinder, prior: FloatArray) ->
     return known
 
 
-def _where_seen(known: AdjustedCylinder) -> Cylinder:
+def where_seen(cylinder: Cylinder, profile: SupportProfile) -> Cylinder:
     """The stretch of a cylinder whose edges are most probable on a pipe; all of it where none are."""
-    profile = support_profile(known.samples, known.hit)
     total = np.append(0.0, np.cumsum(profile.log_odds().sum(axis=1)))
     least = np.minimum.accumulate(total)
     last = int(np.argmax(total - least))
     first = int(np.argmin(total[: last + 1]))
     if first == last:
-        return known.cylinder
-    half = 0.5 * known.cylinder.length
+        return cylinder
+    half = 0.5 * cylinder.length
     between = np.concatenate([[-half], 0.5 * (profile.along[1:] + profile.along[:-1]), [half]])
-    return known.cylinder.cut(float(between[first]) + half, float(between[last]) + half)
+    return cylinder.cut(float(between[first]) + half, float(between[last]) + half)
 
 
 def _step_from(start: Cylinder, scene: Scene) -> FloatArray:

@@ -13,8 +13,10 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.acceptance import VAGUEST
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
+from pipeprog_detect.silhouette.apparent_contour import ViewArrays
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.silhouette.extension import HIDDEN, where_seen
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, mean_centre
@@ -47,15 +49,31 @@ class LineFitter:
         points: of the cloud (N, 3), m.
         radii: planned ones of thin pipes, m.
         boq: the bill of quantities.
+        displaced: by which edges in these images are off what they are edges of [px].
     """
 
     views: Sequence[View]
     points: NDArray[np.float32]
     radii: Sequence[float]
     boq: BillOfQuantities
+    displaced: float = 0.0
 
     def along_known_pipes(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
         """The whole of a pipe of which the direction is known; None where its contour is not seen.
+
+        A proposal may go on along the next pipe, which lies at another depth: the part that is seen counts then.
+        """
+        fit = self._at_its_depth(proposal, known)
+        if fit is None:
+            return None
+        part = where_seen(fit.cylinder, Scene.of(fit.cylinder, self.views, known).support())
+        if fit.cylinder.length - part.length < HIDDEN:
+            return fit
+        alone = self._parallel(part, proposal.depth_sigma, known)
+        return fit if alone is None or alone.log_odds < fit.log_odds else alone
+
+    def _at_its_depth(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
+        """The accepted fit of a proposal, at the depth at which the views show it.
 
         Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
         away looks the same, from where the cloud has it, too, and the most probable fit counts.
@@ -67,7 +85,7 @@ class LineFitter:
         at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, False)
         rough = [(start, min(depth_sigma, DEPTH_REACH))] + ([] if at_depth is None else [(at_depth, LINE_DEPTH_SIGMA)])
         starts = [Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True) for each, sigma in rough]
-        located = [refine(each, self.views, known, self.radii) for each in starts]
+        located = [self._refined(each, known) for each in starts]
         # The known direction is evidence once: the fit has drawn the axis from it as far as the views did.
         again = [
             turned(replace(fit.cylinder, radius=start.radius), start.axis, self.views)
@@ -86,17 +104,23 @@ class LineFitter:
         starts = [
             Start(start, start.radius, True, depth_sigma, PARALLEL_SIGMA, radius_fixed=fixed) for fixed in (False, True)
         ]
-        fits = [refine(each, self.views, known, self.radii) for each in starts]
+        fits = [self._refined(each, known) for each in starts]
         seen = [fit for fit in fits if fit is not None]
         good = (fit for fit in seen if self._accepts(fit, known, PARALLEL_CONVINCING))
         return next(good, None)
 
+    def again(self, fit: ContourFit, known: Sequence[Cylinder]) -> ContourFit | None:
+        """The accepted fit, in these views, of a pipe that other images have measured."""
+        start = Start(fit.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA)
+        found = self._refined(start, known)
+        return found if found is not None and self._accepts(found, known, PARALLEL_CONVINCING) else None
+
     def in_direction(self, start: Cylinder, known: Sequence[Cylinder]) -> list[ContourFit]:
         """The accepted fits of a whole pipe: in the direction of `start`, and, from there, near this direction."""
-        held = refine(Start(start, start.radius, True, LINE_DEPTH_SIGMA, DIRECTION_HELD), self.views, known, self.radii)
+        held = self._refined(Start(start, start.radius, True, LINE_DEPTH_SIGMA, DIRECTION_HELD), known)
         if held is None:
             return []
-        near = refine(Start(held.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA), self.views, known, self.radii)
+        near = self._refined(Start(held.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA), known)
         fits = [held] if near is None else [held, near]
         return [fit for fit in fits if self._accepts(fit, known, PARALLEL_CONVINCING)]
 
@@ -126,8 +150,16 @@ class LineFitter:
     ) -> ContourFit | None:
         """The fit where it has the contour of a pipe and a planned radius; None otherwise."""
         start = Start(proposed, proposed.radius, True, depth_sigma, slope_sigma)
-        fit = refine(start, self.views, known, self.radii, follow)
+        fit = self._refined(start, known, follow)
         return fit if fit is not None and self._accepts(fit, known, LINES_CONVINCING) else None
+
+    def _refined(self, start: Start, known: Sequence[Cylinder], follow: bool = True) -> ContourFit | None:
+        """`refine`, with what the edges of these images are off in the standard deviation of the radius."""
+        fit = refine(start, self.views, known, self.radii, follow)
+        if fit is None or not self.displaced:
+            return fit
+        gain = float(np.median(ViewArrays.of(self.views).pixels_per_metre(fit.cylinder.middle)))
+        return replace(fit, radius_sigma=float(np.hypot(fit.radius_sigma, self.displaced / gain)))
 
     def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], least: tuple[float, float]) -> bool:
         """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does.

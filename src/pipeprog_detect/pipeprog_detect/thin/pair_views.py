@@ -24,6 +24,9 @@ from pipeprog_detect.types import Cylinder, View
 STEP, MOST_VIEWS = 0.12, 120
 # Half of a thin pipe's width [px] that suffices to see its two sides: larger images are reduced.
 ENOUGH = 4.5
+# Points of the cloud in a view that tell what it sees, and so many that more of them move a percentile by less than the
+# range of depths that is added.
+LEAST_POINTS, ENOUGH_POINTS = 100, 5000
 # Standard deviations of a segment pair's centre line and width [px], shading and shadows beside the pipe included.
 CENTRE_SIGMA, WIDTH_SIGMA = 1.0, 1.2
 # A segment lies on an outline within two standard deviations of its place [px]. Spacing [px] of the outline's samples:
@@ -74,7 +77,7 @@ def pair_views(
 def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
     """Views of the cloud's points far enough from the last one to tell more than it did."""
     chosen: list[View] = []
-    sparse = points[:: max(len(points) // 5000, 1)]
+    sparse = points[:: max(len(points) // ENOUGH_POINTS, 1)]
     for view in views:
         depth = _points_in(view, sparse)[1]
         if len(depth) and (
@@ -84,17 +87,20 @@ def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
     return chosen[:: -(-len(chosen) // MOST_VIEWS)] if chosen else []
 
 
-def _pair_view(
-    view: View,
-    points: NDArray[np.float32],
-    radii: Sequence[float],
-    known: Sequence[Cylinder],
-    lines: dict[tuple[int, int], FloatArray],
-) -> PairView | None:
+def distinct_views(views: Sequence[View], points: NDArray[np.float32], radii: Sequence[float]) -> list[View]:
+    """Those of the views that tell more than the one before, as small as thin pipes of these radii [m] allow."""
+    sized = (_sized(view, points, radii) for view in _apart(views, points))
+    return [each[0] for each in sized if each is not None]
+
+
+def _sized(
+    view: View, points: NDArray[np.float32], radii: Sequence[float]
+) -> tuple[View, NDArray[np.float32], NDArray[np.float32]] | None:
+    """The view, reduced to what suffices, and pixels (M, 2) and depths (M,) [m] of points in it; None with too few."""
     pixel, depth = _points_in(view, points)
-    if len(depth) < 100:
+    if len(depth) < LEAST_POINTS:
         return None
-    near, middle, far = np.percentile(depth[:: max(len(depth) // 5000, 1)], [1, 50, 99])
+    middle = np.median(depth[:: max(len(depth) // ENOUGH_POINTS, 1)])
     scale = min(1.0, ENOUGH * middle / (min(radii) * view.camera.fx))
     scale = 2.0 ** (round(4.0 * np.log2(scale)) / 4.0)  # few sizes, so that edges found before serve again
     if scale < 1.0:
@@ -103,6 +109,21 @@ def _pair_view(
         rolled = None if view.rolled is None else view.rolled.scaled(scale)
         view = replace(view, image=image, camera=view.camera.scaled(scale), rolled=rolled)
         pixel = (pixel + 0.5) * scale - 0.5
+    return view, pixel, depth
+
+
+def _pair_view(
+    view: View,
+    points: NDArray[np.float32],
+    radii: Sequence[float],
+    known: Sequence[Cylinder],
+    lines: dict[tuple[int, int], FloatArray],
+) -> PairView | None:
+    sized = _sized(view, points, radii)
+    if sized is None:
+        return None
+    view, pixel, depth = sized
+    near, middle, far = np.percentile(depth[:: max(len(depth) // ENOUGH_POINTS, 1)], [1, 50, 99])
     focal = view.camera.fx
     narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
     key = (view.stamp, view.camera.width)

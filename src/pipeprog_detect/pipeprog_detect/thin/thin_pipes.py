@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.chromaticity import DISPLACED
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.silhouette.contour_fit import ContourFit
@@ -20,7 +22,7 @@ from pipeprog_detect.thin.depth_from_cloud import covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_bare, is_false_line
 from pipeprog_detect.thin.line_fitter import LineFitter, turned
 from pipeprog_detect.thin.line_triangulation import propose
-from pipeprog_detect.thin.pair_views import pair_views
+from pipeprog_detect.thin.pair_views import PairView, distinct_views, pair_views
 from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL, PARALLEL_SIGMA, parallel_directions
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
@@ -63,58 +65,106 @@ def find_thin_pipes(
     radii = [radius for radius in boq.radii if radius < thickest]
     if not views or not radii:
         return []
-    lines = LineFitter(views, points.astype(np.float32, copy=False), radii, boq)
-    some = lines.points[:: -(-len(points) // MOST_POINTS)]
     known = [measured.cylinder for measured in found]
-    thin: list[MeasuredPipe] = []
+    search = _Search(points.astype(np.float32, copy=False), around, thickest, radii, boq, known)
+    coloured = in_colour(views)
+    if coloured:
+        search.along_known_pipes(coloured, distinct_views(coloured, search.some, radii), again=views)
+    seen = pair_views(views, search.some, radii, search.known, edges)
+    search.along_known_pipes(views, [each.view for each in seen])
+    search.by_lines(views, seen)
+    return search.thin
 
-    def is_rival(cylinder: Cylinder) -> bool:
+
+def in_colour(views: Sequence[View]) -> list[View]:
+    """The views with their colour in place of grey, of those that have one."""
+    return [coloured for coloured in (view.in_colour() for view in views) if coloured is not None]
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Thin pipes, beside the `known` cylinders, which it adds to; see `find_thin_pipes`."""
+
+    points: NDArray[np.float32]
+    around: SceneContext
+    thickest: float
+    radii: Sequence[float]
+    boq: BillOfQuantities
+    known: list[Cylinder]
+    thin: list[MeasuredPipe] = field(default_factory=list)
+
+    @cached_property
+    def some(self) -> NDArray[np.float32]:
+        """Points of the cloud, as many as its depths need."""
+        return self.points[:: -(-len(self.points) // MOST_POINTS)]
+
+    def along_known_pipes(self, views: Sequence[View], swept: Sequence[View], again: Sequence[View] = ()) -> None:
+        """Those along the directions of the known pipes that views show, of which the `swept` ones are looked through.
+
+        What these are certain of is measured `again` in others, and counts as they have it where it is more probable.
+        """
+        lines = self._fitter(views, DISPLACED if again else 0.0)
+        proposals = propose_parallel(swept, parallel_directions(self.known), self.radii, self.known)
+        before_walls = [each for each in proposals if not self._is_no_pipe(each.cylinder, views)]
+        for parallel in before_walls[:MOST_PROPOSED]:
+            if not self._is_taken(parallel.cylinder, views):
+                fit = lines.along_known_pipes(parallel, self.known)
+                if fit is not None and again:
+                    other = self._fitter(again).again(fit, self.known)
+                    fit = fit if other is None or other.log_odds < fit.log_odds else other
+                self._consider(fit, views)
+
+    def by_lines(self, views: Sequence[View], seen: Sequence[PairView]) -> None:
+        """Those that segment pairs propose, in any direction."""
+        lines = self._fitter(views)
+        for proposed in propose(seen, self.some, self.radii, MOST_PROPOSED):
+            if not self._is_taken(proposed, views):
+                fit = lines.measure(proposed, self.known, follow=False)
+                self._consider(None if fit is None else lines.follow(fit, proposed.radius, self.known), views)
+
+    def _fitter(self, views: Sequence[View], displaced: float = 0.0) -> LineFitter:
+        return LineFitter(views, self.points, self.radii, self.boq, displaced)
+
+    def _is_taken(self, cylinder: Cylinder, views: Sequence[View]) -> bool:
+        return is_known(cylinder, self.known) or self._is_rival(cylinder, views)
+
+    def _is_rival(self, cylinder: Cylinder, views: Sequence[View]) -> bool:
         """Whether the views show it, or most of it, where they show a thin pipe: only one can be there."""
         centre = mean_centre(cylinder, views)
         most = 0.5 * cylinder.length
         return centre is not None and any(
             covers(each, cylinder, centre, SAME_LINE) or covers(each, cylinder, centre, TOUCHING, most)
-            for each in known
-            if each.radius < thickest
+            for each in self.known
+            if each.radius < self.thickest
         )
 
-    def is_no_pipe(cylinder: Cylinder) -> bool:
+    def _is_no_pipe(self, cylinder: Cylinder, views: Sequence[View]) -> bool:
         """Whether it is a line on a wall, or looks like the one in which two walls meet."""
         centre = mean_centre(cylinder, views)
-        return around.touches_wall(cylinder) or (centre is not None and is_corner(cylinder, centre, around))
+        return self.around.touches_wall(cylinder) or (centre is not None and is_corner(cylinder, centre, self.around))
 
-    def is_missing(cylinder: Cylinder) -> bool:
+    def _is_missing(self, cylinder: Cylinder, views: Sequence[View]) -> bool:
         """Whether the cloud, the walls or the known pipes would show or hide it, were it there."""
         centre = mean_centre(cylinder, views)
-        return (centre is not None and is_bare(cylinder, lines.points, centre)) or (
-            Scene.of(cylinder, views, known).visible_share() < MOSTLY_SEEN
+        return (centre is not None and is_bare(cylinder, self.points, centre)) or (
+            Scene.of(cylinder, views, self.known).visible_share() < MOSTLY_SEEN
         )
 
-    def consider(fit: ContourFit | None) -> None:
-        if fit is None or is_stub(fit.cylinder) or is_known(fit.cylinder, known) or is_shadow(fit.cylinder, known):
+    def _consider(self, fit: ContourFit | None, views: Sequence[View]) -> None:
+        """Takes a fit for a pipe where nothing says that it is none."""
+        if fit is None:
             return
-        if is_rival(fit.cylinder):
-            return
-        if is_no_pipe(fit.cylinder):
-            return
-        if is_false_line(fit.cylinder, fit, some, around.planes, views, known):
-            return
-        if is_missing(fit.cylinder):
-            return
-        thin.append(MeasuredPipe.of_contour(_as_candidate(fit, lines.points), fit))
-        known.append(fit.cylinder)
-
-    seen = pair_views(views, some, radii, known, edges)
-    swept = propose_parallel([each.view for each in seen], parallel_directions(known), radii, known)
-    before_walls = [each for each in swept if not is_no_pipe(each.cylinder)]
-    for parallel in before_walls[:MOST_PROPOSED]:
-        if not is_known(parallel.cylinder, known) and not is_rival(parallel.cylinder):
-            consider(lines.along_known_pipes(parallel, known))
-    for proposed in propose(seen, some, radii, MOST_PROPOSED):
-        if not is_known(proposed, known) and not is_rival(proposed):
-            fit = lines.measure(proposed, known, follow=False)
-            consider(None if fit is None else lines.follow(fit, proposed.radius, known))
-    return thin
+        cylinder = fit.cylinder
+        if not (
+            is_stub(cylinder)
+            or is_shadow(cylinder, self.known)
+            or self._is_taken(cylinder, views)
+            or self._is_no_pipe(cylinder, views)
+            or is_false_line(cylinder, fit, self.some, self.around.planes, views, self.known)
+            or self._is_missing(cylinder, views)
+        ):
+            self.thin.append(MeasuredPipe.of_contour(_as_candidate(fit, self.points), fit))
+            self.known.append(cylinder)
 
 
 def turned_parallel(

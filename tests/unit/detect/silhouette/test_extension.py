@@ -61,7 +61,7 @@ def test_a_stub_is_not_cut_to_less_than_its_width(
     """Of a contour of little contrast one position alone may show edges more often than texture does."""
     stub = adjusted(Scene.of(PIPE.cut(0.1, 0.3), pipe_views, []), np.eye(5), np.zeros(5))
     assert stub is not None
-    monkeypatch.setattr(extension, "_where_seen", lambda _: PIPE.cut(0.2, 0.2 + seen))
+    monkeypatch.setattr(extension, "where_seen", lambda *_: PIPE.cut(0.2, 0.2 + seen))
     cut = without_bend(replace(stub, share=0.4), PIPE.cut(0.1, 0.3), np.eye(5))
     assert cut.cylinder.length == pytest.approx(seen if seen > 2.0 * PIPE.radius else 0.2, abs=1e-5)
 

@@ -14,7 +14,8 @@ from pipeprog_detect.thin import line_fitter
 from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned
 from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL
-from pipeprog_detect.types import Cylinder
+from pipeprog_detect.types import Cylinder, View
+from tests.unit.detect.pipe_and_wall import PIPE
 from tests.unit.detect.straight_ahead import level, looking_along_y
 
 
@@ -121,3 +122,20 @@ def test_a_piece_stands_where_the_cloud_has_it_and_the_whole_is_no_pipe(
     boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     lines = LineFitter(views, np.zeros((0, 3), np.float32), [0.0086], boq)
     assert lines.follow(piece, 0.0086, []) is (piece if stands else longer if whole else None)
+
+
+def test_of_a_proposal_that_goes_on_beyond_the_pipe_the_pipe_counts(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next pipe in line, at another depth, shows edges to some of the views only."""
+    boq = BillOfQuantities((PipeClass("DN 65", PIPE.radius, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    lines = LineFitter(pipe_views, np.zeros((0, 3), np.float32), [PIPE.radius], boq)
+    longer = PIPE.cut(0.0, PIPE.length + 0.45)
+    whole = ContourFit(longer, np.eye(3)[:2], np.eye(5), 1e-4, 0.5, 20.0, 8, (0.0, 0.0), 0.0, 0.1)
+    monkeypatch.setattr(LineFitter, "_at_its_depth", lambda *_: whole)
+    found = lines.along_known_pipes(Proposal(longer, 2e-3, 50.0), [])
+    assert found is not None
+    assert found.cylinder.length == pytest.approx(PIPE.length, abs=0.02)
+    assert found.cylinder.radius == pytest.approx(PIPE.radius, abs=1e-3)
+    monkeypatch.setattr(LineFitter, "_parallel", lambda *_: None)
+    assert lines.along_known_pipes(Proposal(longer, 2e-3, 50.0), []) is whole

@@ -3,16 +3,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
+from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.thin.line_fitter import LineFitter
-from pipeprog_detect.thin.thin_pipes import is_shadow, turned_parallel
+from pipeprog_detect.thin.thin_pipes import find_thin_pipes, is_shadow, turned_parallel
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+from pipeprog_detect.verification.scene_context import SceneContext
+from sitegen.primitives import cylinder
+from sitegen.site import CONCRETE
+from tests.unit.detect.pipe_and_wall import front_points
+from tests.unit.detect.rendered_site import walk_past
 from tests.unit.detect.straight_ahead import level, looking_along_y
 
 
@@ -56,3 +65,25 @@ def test_two_pipes_cannot_lie_within_each_other(apart: float, shadow: bool) -> N
     assert is_shadow(beside, [level(1.6)]) is shadow
     assert not is_shadow(beside.shifted(np.array([1.0, 0.0, 0.0])), [level(1.6)])  # beyond its end
     assert not is_shadow(level(0.35, turn=np.radians(30.0)).shifted(np.array([0.0, 0.01, 0.0])), [level(1.6)])
+
+
+def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour() -> None:
+    """Grey shows the wall as it is without the pipe."""
+    copper = replace(CONCRETE, name="copper", colour=(0.75, 0.41, 0.12))
+    pipe = Cylinder(np.array([-0.45, -0.08, 0.02]), np.array([0.45, -0.08, 0.02]), 0.0086)
+    grey = [replace(view, chromaticity=None) for view in walk_past([])]
+    coloured = walk_past([cylinder(pipe.start, pipe.end, pipe.radius, copper)])
+    views = [replace(view, chromaticity=other.chromaticity) for view, other in zip(grey, coloured, strict=True)]
+    x, z = np.meshgrid(np.arange(-1.5, 1.5, 0.01), np.arange(-0.5, 1.0, 0.01))
+    wall = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    cloud, tree = np.vstack([wall, front_points(pipe)]), octree.build(wall)
+    around = SceneContext(tree, None, [Plane(np.array([0.0, -1.0, 0.0]), 0.0, 4.5)], tree, 1e-3)
+    boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    above = [Cylinder(np.array([-1.0, y, 3.0]), np.array([1.0, y, 3.0]), 0.05) for y in (-0.1, -0.3, -0.5)]
+    known = [measured(each, 100.0) for each in above]
+    assert find_thin_pipes(cloud, around, 0.02, known, grey, boq, {}) == []
+    (found,) = find_thin_pipes(cloud, around, 0.02, known, views, boq, {})
+    ends = np.stack([found.cylinder.start, found.cylinder.end])
+    assert np.linalg.norm(pipe.from_axis(ends), axis=1).max() < 0.003
+    assert found.cylinder.length == pytest.approx(pipe.length, abs=0.02)
+    assert abs(found.cylinder.radius - pipe.radius) < 3.0 * found.radius_sigma
