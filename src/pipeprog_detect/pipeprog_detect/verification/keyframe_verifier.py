@@ -19,7 +19,7 @@ from pipeprog_detect.silhouette.one_sided import only_visible_side
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
+from pipeprog_detect.verification.measured_pipe import DECISIVE, MeasuredPipe, is_stub
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.radius_agreement import agree, contradict, is_resolved
 
@@ -108,22 +108,30 @@ class KeyframeVerifier:
         """The candidates that stand, measured by their contours.
 
         `trusted`: whether the cloud alone makes a pipe of a candidate. Those with most points come first; the cylinders
-        that they turn out to be hide the others when these are measured.
+        that they turn out to be hide the others when these are measured. One that lies within another takes its place
+        only where the edges are decisively its own and not the other's: pipes of several radii in line may look like a
+        thicker one in the cloud.
         """
         order = sorted(range(len(candidates)), key=lambda number: -candidates[number].points)
         current = {(number, 0): candidates[number].cylinder for number in order if trusted[number]}  # and piece
-        found: list[MeasuredPipe] = []
+        found: dict[tuple[int, int], MeasuredPipe] = {}
         for number in order:
             others = [cylinder for (other, _), cylinder in current.items() if other != number]
             measured = self._measured(candidates[number], others, trusted[number])
-            if measured is None or is_known(measured.cylinder, [known.cylinder for known in found]):
+            if measured is None:
                 continue
+            around = [place for place, known in found.items() if known.cylinder.contains(measured.cylinder.middle)]
+            if not all(_is_refuted(found[place], measured) for place in around):
+                continue
+            for place in around:
+                del found[place], current[place]
             pieces = self._pieces(measured, others, trusted[number])
             if not pieces:
                 current.pop((number, 0), None)
-            current |= {(number, index): piece.cylinder for index, piece in enumerate(pieces)}
-            found += pieces
-        return found
+            places = {(number, index): piece for index, piece in enumerate(pieces)}
+            current |= {place: piece.cylinder for place, piece in places.items()}
+            found |= places
+        return list(found.values())
 
     def _pieces(self, measured: MeasuredPipe, others: Sequence[Cylinder], trusted: bool) -> list[MeasuredPipe]:
         """The pipe itself, or what lies between the stretches at which the views see through it, measured anew."""
@@ -184,6 +192,13 @@ class KeyframeVerifier:
     def _shows_both_sides(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
         """Whether it has edges on each side that is not hidden: a board or a step has them on one."""
         return Scene.of(cylinder, self._views, others).support().weaker_share >= MIN_SUPPORT
+
+
+def _is_refuted(known: MeasuredPipe, within: MeasuredPipe) -> bool:
+    """Whether the edges seen are decisively those of the pipe `within`, and not those of the one around it."""
+    return (
+        known.fit is not None and known.fit.log_odds < 0.0 and within.fit is not None and within.fit.log_odds > DECISIVE
+    )
 
 
 def _resembles(one: Cylinder, other: Cylinder) -> bool:

@@ -16,6 +16,7 @@ from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CandidateFitter
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
 from tests.unit.detect.straight_ahead import looking_along_y
 
@@ -123,3 +124,23 @@ def test_a_pipe_of_which_the_cloud_shows_a_piece_is_measured_whole(
     assert len(found) == 1
     assert found[0].cylinder.length == pytest.approx(PIPE.length, abs=4e-3)
     assert found[0].cylinder.radius == pytest.approx(PIPE.radius, abs=5e-4)
+
+
+@pytest.mark.parametrize(("outer", "inner", "stands"), [(-30.0, 100.0, 1), (5.0, 100.0, 0), (-30.0, 5.0, 0)])
+def test_of_two_pipes_in_one_place_the_edges_tell_which(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, outer: float, inner: float, stands: int
+) -> None:
+    """Pipes of several radii in line look like a thicker one in the cloud, which has most points."""
+    odds = {0.09: outer, PIPE.radius: inner}
+
+    def measured(self: KeyframeVerifier, candidate: Candidate, others: list[Cylinder], trusted: bool) -> MeasuredPipe:
+        cylinder = candidate.cylinder
+        fit = ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, odds[cylinder.radius], 20, (0.0, 0.0), 0.0, 0.5)
+        return MeasuredPipe.of_contour(candidate, fit)
+
+    monkeypatch.setattr(KeyframeVerifier, "_measured", measured)
+    monkeypatch.setattr(KeyframeVerifier, "_pieces", lambda self, whole, *_: [whole])
+    evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
+    candidates = [Candidate(PIPE, 2e-4, 500, evidence), Candidate(replace(PIPE, radius=0.09), 2e-4, 5000, evidence)]
+    found = KeyframeVerifier(pipe_views, BOQ).measure(candidates, [True, True])
+    assert [each.cylinder.radius for each in found] == [(0.09, PIPE.radius)[stands]]
