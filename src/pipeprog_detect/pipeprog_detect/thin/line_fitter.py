@@ -61,13 +61,14 @@ class LineFitter:
     def along_known_pipes(self, proposal: Proposal, known: Sequence[Cylinder]) -> ContourFit | None:
         """The whole of a pipe of which the direction is known; None where its contour is not seen.
 
-        A proposal may go on along the next pipe, which lies at another depth: the part that is seen counts then.
+        A proposal may go on along the next pipe, which lies at another depth: the part that is seen counts then, if it
+        is most of the proposal, which was put at its depth.
         """
         fit = self._at_its_depth(proposal, known)
         if fit is None:
             return None
         part = where_seen(fit.cylinder, Scene.of(fit.cylinder, self.views, known).support())
-        if fit.cylinder.length - part.length < HIDDEN:
+        if not HIDDEN < fit.cylinder.length - part.length < 0.5 * fit.cylinder.length:
             return fit
         alone = self._parallel(part, proposal.depth_sigma, known)
         return fit if alone is None or alone.log_odds < fit.log_odds else alone

@@ -130,7 +130,7 @@ def test_of_a_proposal_that_goes_on_beyond_the_pipe_the_pipe_counts(
     """The next pipe in line, at another depth, shows edges to some of the views only."""
     boq = BillOfQuantities((PipeClass("DN 65", PIPE.radius, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     lines = LineFitter(pipe_views, np.zeros((0, 3), np.float32), [PIPE.radius], boq)
-    longer = PIPE.cut(0.0, PIPE.length + 0.45)
+    longer = PIPE.cut(0.0, PIPE.length + 0.35)
     whole = ContourFit(longer, np.eye(3)[:2], np.eye(5), 1e-4, 0.5, 20.0, 8, (0.0, 0.0), 0.0, 0.1)
     monkeypatch.setattr(LineFitter, "_at_its_depth", lambda *_: whole)
     found = lines.along_known_pipes(Proposal(longer, 2e-3, 50.0), [])
