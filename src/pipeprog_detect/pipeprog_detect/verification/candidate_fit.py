@@ -139,7 +139,8 @@ class CandidateFitter:
         no observation, and what they tell where it is left free takes its place.
         Stereo makes an arc too flat, never too narrow: a thinner planned radius may be farther from the cloud's.
         Where the cloud resolves the section any support that makes a fit suffices. Where it does not, or the radius
-        was given to it, more than half of the contour must be supported, where the surface allows it.
+        was given to it, more than half of the contour must be supported, where the surface allows it; a radius of which
+        less is still is a rival of others.
         """
         told_by_cloud = is_resolved(candidate) and not candidate.radius_held
         if candidate.radius_held:
@@ -159,13 +160,13 @@ class CandidateFitter:
                 if fit is not None:
                     aside = float(np.linalg.norm(surface.from_axis(fit.cylinder.middle[None])))
                     moved = aside * np.sin(_seen_arc(candidate).half) / _sigma(candidate)
-                    if not told_by_cloud and not (moved < REACH and fit.support > CONVINCING):
-                        continue
-                    ranked.append((fit.log_odds - 0.5 * (misfit**2 + moved**2), fit))
+                    stands = told_by_cloud or (moved < REACH and fit.support > CONVINCING)
+                    ranked.append((fit.log_odds - 0.5 * (misfit**2 + moved**2), stands, fit))
         ranked.sort(key=lambda entry: -entry[0])
-        if len(ranked) > 1 and ranked[0][0] - ranked[1][0] < STRONG:
+        if not ranked or (len(ranked) > 1 and ranked[0][0] - ranked[1][0] < STRONG):
             return None
-        return ranked[0][1] if ranked else None
+        _, stands, best = ranked[0]
+        return best if stands else None
 
     def strays(self, candidate: Candidate, fit: ContourFit) -> bool:
         """Whether the fit has a radius out of reach of the candidate's: it follows the edges of other things."""

@@ -109,8 +109,8 @@ class KeyframeVerifier:
 
         `trusted`: whether the cloud alone makes a pipe of a candidate. Those with most points come first; the cylinders
         that they turn out to be hide the others when these are measured. One that lies within another takes its place
-        only where the edges are decisively its own and not the other's: pipes of several radii in line may look like a
-        thicker one in the cloud.
+        only where the edges are decisively its own: pipes of several radii in line may look like a thicker one in the
+        cloud, and one side of a pipe like that of a thinner one.
         """
         order = sorted(range(len(candidates)), key=lambda number: -candidates[number].points)
         current = {(number, 0): candidates[number].cylinder for number in order if trusted[number]}  # and piece
@@ -195,10 +195,11 @@ class KeyframeVerifier:
 
 
 def _is_refuted(known: MeasuredPipe, within: MeasuredPipe) -> bool:
-    """Whether the edges seen are decisively those of the pipe `within`, and not those of the one around it."""
-    return (
-        known.fit is not None and known.fit.log_odds < 0.0 and within.fit is not None and within.fit.log_odds > DECISIVE
-    )
+    """Whether the edges seen are decisively more probable on the pipe `within`, along more of it, than on the other."""
+    one, other = known.fit, within.fit
+    if one is None or other is None:
+        return False
+    return other.log_odds - one.log_odds > DECISIVE and other.log_odds > DECISIVE and other.support > one.support
 
 
 def _resembles(one: Cylinder, other: Cylinder) -> bool:

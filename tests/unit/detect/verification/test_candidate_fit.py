@@ -14,7 +14,7 @@ from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.one_sided import SeenArc, with_radius
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification import candidate_fit
+from pipeprog_detect.verification import candidate_fit, radius_agreement
 from pipeprog_detect.verification.candidate_fit import CandidateFitter
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
@@ -108,6 +108,25 @@ def test_the_side_that_is_seen_tells_two_planned_radii_apart(
     assert (fit and fit.cylinder.radius) == told
     # At 3.4 sigma the surface does not allow a size.
     assert CandidateFitter(_boq(0.1035), MeasurementCache()).of_visible_side(candidate, [], []) is None
+
+
+@pytest.mark.parametrize(("odds", "told"), [(31.0, None), (40.0, None), (15.0, 0.1095)])
+def test_a_radius_of_which_little_is_seen_is_a_rival_of_others(
+    odds: float, told: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A DN100 became a DN65: its own fit had support along less than half, and nearly the same odds."""
+    cylinder = Cylinder(np.zeros(3), np.array([3.0, 0.0, 0.0]), 0.116)
+    candidate = Candidate(cylinder, 2.7e-3, 2000, CloudEvidence(np.radians(80.0), 0.96, 0.0, 5e-3, 6e-4, 3.0))
+    assert not radius_agreement.is_resolved(candidate)
+
+    def fitted(_: Candidate, known: Cylinder, *__: object) -> ContourFit:
+        support, log_odds = (0.55, 32.0) if known.radius < 0.11 else (0.4, odds)
+        return ContourFit(known, np.eye(3)[1:], np.eye(5), 2e-4, support, log_odds, 20, (0.0, 0.0), 0.0, 0.5)
+
+    monkeypatch.setattr(candidate_fit, "_of_one_side", fitted)
+    monkeypatch.setattr(candidate_fit, "_with_surface", lambda _, radius, *__: replace(cylinder, radius=radius))
+    fit = CandidateFitter(_boq(0.1095, 0.1223), MeasurementCache()).of_visible_side(candidate, [], [])
+    assert (fit and fit.cylinder.radius) == told
 
 
 @pytest.mark.parametrize(("arc", "told"), [(70.0, None), (140.0, 0.1095)])

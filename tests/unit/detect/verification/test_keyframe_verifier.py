@@ -126,16 +126,19 @@ def test_a_pipe_of_which_the_cloud_shows_a_piece_is_measured_whole(
     assert found[0].cylinder.radius == pytest.approx(PIPE.radius, abs=5e-4)
 
 
-@pytest.mark.parametrize(("outer", "inner", "stands"), [(-30.0, 100.0, 1), (5.0, 100.0, 0), (-30.0, 5.0, 0)])
+@pytest.mark.parametrize(
+    ("outer", "inner", "share", "stands"),
+    [(-30.0, 100.0, 0.6, 1), (70.0, 100.0, 0.6, 1), (95.0, 100.0, 0.6, 0), (-30.0, 5.0, 0.6, 0), (70.0, 100.0, 0.4, 0)],
+)
 def test_of_two_pipes_in_one_place_the_edges_tell_which(
-    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, outer: float, inner: float, stands: int
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, outer: float, inner: float, share: float, stands: int
 ) -> None:
     """Pipes of several radii in line look like a thicker one in the cloud, which has most points."""
-    odds = {0.09: outer, PIPE.radius: inner}
+    told = {0.09: (0.5, outer), PIPE.radius: (share, inner)}
 
     def measured(self: KeyframeVerifier, candidate: Candidate, others: list[Cylinder], trusted: bool) -> MeasuredPipe:
         cylinder = candidate.cylinder
-        fit = ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, odds[cylinder.radius], 20, (0.0, 0.0), 0.0, 0.5)
+        fit = ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 2e-4, *told[cylinder.radius], 20, (0.0, 0.0), 0.0, 0.5)
         return MeasuredPipe.of_contour(candidate, fit)
 
     monkeypatch.setattr(KeyframeVerifier, "_measured", measured)
