@@ -152,18 +152,17 @@ def detect_outside(
     # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
     criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
     measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
-    judging = _with_blur(judging, measured)
+    judging, coloured = _with_blur(judging, measured), in_colour(judging)
     points = (prepared.points if judging else prepared.points[:0]).astype(np.float32)  # for what is judged in the views
 
     def is_genuine(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
         return not is_false_line(each.cylinder, each.fit, points, around.planes, judging, others)
 
     def is_supported(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
-        return any(is_probable(each.cylinder, shown, others) for shown in (judging, in_colour(judging)) if shown)
+        return any(is_probable(each.cylinder, shown, others) for shown in (judging, coloured) if shown)
 
     def has_two_edges(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
-        both = (judging, in_colour(judging))
-        return not all(is_one_step(Scene.of(each.cylinder, shown, others)) for shown in both if shown)
+        return not all(is_one_step(Scene.of(each.cylinder, shown, others)) for shown in (judging, coloured) if shown)
 
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
     # What is dropped in the end hides no whole pipe now, nor does a stub of one.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
-from pipeprog_detect.chromaticity import red_against_blue
+from pipeprog_detect.silhouette.chromaticity import red_against_blue
 from pipeprog_detect.types import View
 
 # Decoded images kept [bytes], each with its colour: 290 of 720p, 32 of 4K.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.chromaticity import red_against_blue
+from pipeprog_detect.silhouette.chromaticity import red_against_blue
 from pipeprog_detect.types import View
 from sitegen.primitives import Primitive, rectangle
 from sitegen.render import Lamp, Lens, build_scene, render

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.chromaticity import DARK, red_against_blue
 from pipeprog_detect.keyframe_cache import Keyframes
+from pipeprog_detect.silhouette.chromaticity import DARK, red_against_blue
 from pipeprog_detect.silhouette.light_sampling import LINEAR_LIGHT
 
 LEVEL = st.integers(0, 255)
