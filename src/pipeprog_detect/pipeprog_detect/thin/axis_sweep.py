@@ -37,6 +37,8 @@ NEAREST = 0.3
 STEP_ROWS, BASELINE = 2.0, 1.5
 # Evidence is gathered in stretches of this length [m], shorter than a clamp, up to this far from a line's middle [m].
 STRETCH, LONGEST = 0.05, 3.0
+# Pipes in one line within that reach: of three in a rack, end to end, the middle one's line shows both others.
+IN_LINE = 3
 # While the depth of a line is sought a stretch is two of its columns at every depth (24 px, 5 cm at 2 m), and odds are
 # told in these: what is longer because it is farther away has no more evidence.
 COLUMNS = 2
@@ -315,13 +317,17 @@ def _distances(
 
 @njit(cache=True, nogil=True)
 def _best_run(gains: FloatArray) -> tuple[float, int, int]:
-    """The largest sum of consecutive gains (B,), where its run begins, and where it ends; 0 without a positive one."""
+    """The largest sum of consecutive gains (B,), where its run begins, and where it ends; 0 without a positive one.
+
+    A run ends where what follows is decisively no pipe: the next one in line, beyond a gap, has a run of its own.
+    """
     best, low, high = 0.0, 0, 0
-    running, begin = 0.0, 0
+    running, peak, begin = 0.0, 0.0, 0
     for b in range(len(gains)):
-        if running <= 0.0:
-            running, begin = 0.0, b
+        if running <= 0.0 or running < peak - DECISIVE:
+            running, peak, begin = 0.0, 0.0, b
         running += gains[b]
+        peak = max(peak, running)
         if running > best:
             best, low, high = running, begin, b + 1
     return best, low, high
@@ -352,11 +358,11 @@ def _at_best_depth(
     odds: FloatArray,
     radius: float,
 ) -> FloatArray:
-    """The axes (N, _COLUMNS) of lines (N, 6), which are a view's number and what `_lines` gives; 0 where there is none.
+    """The axes (M, _COLUMNS) of lines (N, 6), which are a view's number and what `_lines` gives; 0 where there is none.
 
-    For the other arguments see `_weigh`.
+    Each line has up to `IN_LINE` of them, end to end. For the other arguments see `_weigh`.
     """
-    result = np.zeros((len(lines), _COLUMNS))
+    result = np.zeros((len(lines) * IN_LINE, _COLUMNS))
     longest = int(2.0 * LONGEST / STRETCH)
     for k in range(len(lines)):
         v, first, last = int(lines[k, 0]), int(lines[k, 2]), int(lines[k, 3])
@@ -383,10 +389,13 @@ def _at_best_depth(
         low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
         at = (x, y, low, STRETCH)
         agreeing, centre_x, centre_y, along = _weigh(at, total[:longest], place, size, edges, reach, odds, radius)
-        best, begin, end = _best_run(total[:longest])
-        result[k, _ODDS] = best * STRETCH / (COLUMNS * place[v, 6] * away)
-        result[k, _X], result[k, _Y], result[k, _SIGMA], result[k, _VIEWS] = x, y, sigma, agreeing
-        result[k, _LOW], result[k, _HIGH] = low + begin * STRETCH, low + end * STRETCH
-        result[k, _CENTRE_X], result[k, _CENTRE_Y], result[k, _CENTRE_ALONG] = centre_x, centre_y, along
-        result[k, _LINE] = k
+        for each in range(IN_LINE):
+            best, begin, end = _best_run(total[:longest])
+            total[begin:end] = -np.inf
+            row = result[k * IN_LINE + each]
+            row[_ODDS] = best * STRETCH / (COLUMNS * place[v, 6] * away)
+            row[_X], row[_Y], row[_SIGMA], row[_VIEWS] = x, y, sigma, agreeing
+            row[_LOW], row[_HIGH] = low + begin * STRETCH, low + end * STRETCH
+            row[_CENTRE_X], row[_CENTRE_Y], row[_CENTRE_ALONG] = centre_x, centre_y, along
+            row[_LINE] = k
     return result

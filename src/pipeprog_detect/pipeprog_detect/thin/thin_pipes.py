@@ -133,7 +133,7 @@ class _Search:
         centre = mean_centre(cylinder, views)
         most = 0.5 * cylinder.length
         return centre is not None and any(
-            covers(each, cylinder, centre, SAME_LINE) or covers(each, cylinder, centre, TOUCHING, most)
+            covers(each, cylinder, centre, SAME_LINE, 0.0) or covers(each, cylinder, centre, TOUCHING, most)
             for each in self.known
             if each.radius < self.thickest
         )
