@@ -37,6 +37,9 @@ NEAREST = 0.3
 STEP_ROWS, BASELINE = 2.0, 1.5
 # Evidence is gathered in stretches of this length [m], shorter than a clamp, up to this far from a line's middle [m].
 STRETCH, LONGEST = 0.05, 3.0
+# A pipe ends where what follows is texture with these log odds (a hundred to one), which takes more than two stretches:
+# no clamp ends it.
+ENDED = float(np.log(100.0))
 # Pipes in one line within that reach: of three in a rack, end to end, the middle one's line shows both others.
 IN_LINE = 3
 # While the depth of a line is sought a stretch is two of its columns at every depth (24 px, 5 cm at 2 m), and odds are
@@ -324,7 +327,7 @@ def _best_run(gains: FloatArray) -> tuple[float, int, int]:
     best, low, high = 0.0, 0, 0
     running, peak, begin = 0.0, 0.0, 0
     for b in range(len(gains)):
-        if running <= 0.0 or running < peak - DECISIVE:
+        if running <= 0.0 or running < peak - ENDED:
             running, peak, begin = 0.0, 0.0, b
         running += gains[b]
         peak = max(peak, running)
