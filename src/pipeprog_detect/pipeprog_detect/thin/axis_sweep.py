@@ -37,9 +37,10 @@ NEAREST = 0.3
 STEP_ROWS, BASELINE = 2.0, 1.5
 # Evidence is gathered in stretches of this length [m], shorter than a clamp, up to this far from a line's middle [m].
 STRETCH, LONGEST = 0.05, 3.0
-# A pipe ends where what follows is texture with these log odds (a hundred to one), which takes more than two stretches:
-# no clamp ends it.
-ENDED = float(np.log(100.0))
+# A pipe shows its edges about as often all along. Less than half as often as its clearer quarter does is something else
+# in line with it, which ends it with these log odds (a hundred to one), and where that is more than two clear stretches
+# would make good: no clamp ends it.
+LEVEL, CLEARER, ENDED, CLAMPED = 0.5, 75.0, float(np.log(100.0)), 1.5
 # Pipes in one line within that reach: of three in a rack, end to end, the middle one's line shows both others.
 IN_LINE = 3
 # While the depth of a line is sought a stretch is two of its columns at every depth (24 px, 5 cm at 2 m), and odds are
@@ -237,6 +238,7 @@ def _block_of(row: float, rows: int) -> int:
 def _weigh(
     at: tuple[float, float, float, float],
     total: FloatArray,
+    weight: FloatArray,
     place: FloatArray,
     size: IntArray,
     edges: NDArray[np.uint8],
@@ -246,12 +248,14 @@ def _weigh(
 ) -> tuple[int, float, float, float]:
     """Sets `total` (B,) to the log odds of a cylinder's stretches; number of views that agree, and their mean centre.
 
+    And `weight` (B,) to the number of independent views that see each.
+
     `at`: the place across the direction (2) and where the first stretch begins, and how long each is [m]; the others:
     see `_Stack`, and `_lines` for `odds` (V, W, 2).
     """
     x, y, low, step = at
-    seen = np.zeros(len(total))
-    total[:] = 0.0
+    seen = weight
+    total[:], seen[:] = 0.0, 0.0
     agreeing, centre_x, centre_y, centre_along = 0, 0.0, 0.0, 0.0
     for v in range(len(place)):
         dx, dy = x - place[v, 0], y - place[v, 1]
@@ -283,7 +287,8 @@ def _weigh(
             centre_x, centre_y = centre_x + place[v, 0], centre_y + place[v, 1]
             centre_along += place[v, 2]
     for b in range(len(total)):
-        total[b] /= 1.0 + COMMON * max(seen[b] - 1.0, 0.0)
+        alike = 1.0 + COMMON * max(seen[b] - 1.0, 0.0)
+        total[b], weight[b] = total[b] / alike, seen[b] / alike
     share = 1.0 / max(agreeing, 1)
     return agreeing, share * centre_x, share * centre_y, share * centre_along
 
@@ -319,21 +324,34 @@ def _distances(
 
 
 @njit(cache=True, nogil=True)
-def _best_run(gains: FloatArray) -> tuple[float, int, int]:
-    """The largest sum of consecutive gains (B,), where its run begins, and where it ends; 0 without a positive one.
+def _best_run(gains: FloatArray, weight: FloatArray) -> tuple[float, int, int]:
+    """The log odds of the most probable pipe in a line, where it begins, and where it ends; 0 without one.
 
-    A run ends where what follows is decisively no pipe: the next one in line, beyond a gap, has a run of its own.
+    `gains` (B,) are the log odds of its stretches, `weight` (B,) the number of independent views that see each.
     """
+    low, high = _largest_sum(gains, np.inf)
+    seen = np.flatnonzero(weight[low:high] > 0.0) + low
+    if not len(seen):
+        return 0.0, 0, 0
+    level = LEVEL * np.percentile(gains[seen] / weight[seen], CLEARER)
+    clear = np.percentile(gains[seen], CLEARER)
+    begin, end = _largest_sum(gains[low:high] - level * weight[low:high], max(ENDED, CLAMPED * clear))
+    return gains[low + begin : low + end].sum(), low + begin, low + end
+
+
+@njit(cache=True, nogil=True)
+def _largest_sum(gains: FloatArray, ended: float) -> tuple[int, int]:
+    """Begin and end of the run of gains (B,) with the largest sum; none goes on where it has lost `ended` of it."""
     best, low, high = 0.0, 0, 0
     running, peak, begin = 0.0, 0.0, 0
     for b in range(len(gains)):
-        if running <= 0.0 or running < peak - ENDED:
+        if running <= 0.0 or running < peak - ended:
             running, peak, begin = 0.0, 0.0, b
         running += gains[b]
         peak = max(peak, running)
         if running > best:
             best, low, high = running, begin, b + 1
-    return best, low, high
+    return low, high
 
 
 @njit(cache=True, nogil=True)
@@ -374,12 +392,12 @@ def _at_best_depth(
         across, up = np.cos(angle), np.sin(angle)
         least, most = (first + place[v, 5]) * place[v, 6], (last + 1.0 + place[v, 5]) * place[v, 6]
         count = max((last + 1 - first) // COLUMNS, 3)
-        total = np.empty(max(longest, count))
+        total, weight = np.empty(max(longest, count)), np.empty(max(longest, count))
         scores = np.empty(len(distances))
         for d, away in enumerate(distances):
             low, step = place[v, 2] + least * away, (most - least) * away / count
             at = (place[v, 0] + away * across, place[v, 1] + away * up, low, step)
-            _weigh(at, total[:count], place, size, edges, reach, odds, radius)
+            _weigh(at, total[:count], weight[:count], place, size, edges, reach, odds, radius)
             scores[d] = total[:count].sum()
         if not (scores > 0.0).any():
             continue
@@ -391,9 +409,10 @@ def _at_best_depth(
         x, y = place[v, 0] + away * across, place[v, 1] + away * up
         low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
         at = (x, y, low, STRETCH)
-        agreeing, centre_x, centre_y, along = _weigh(at, total[:longest], place, size, edges, reach, odds, radius)
+        total, weight = total[:longest], weight[:longest]
+        agreeing, centre_x, centre_y, along = _weigh(at, total, weight, place, size, edges, reach, odds, radius)
         for each in range(IN_LINE):
-            best, begin, end = _best_run(total[:longest])
+            best, begin, end = _best_run(total, weight)
             total[begin:end] = -np.inf
             row = result[k * IN_LINE + each]
             row[_ODDS] = best * STRETCH / (COLUMNS * place[v, 6] * away)
