@@ -77,7 +77,8 @@ class LineFitter:
         """The accepted fit of a proposal, at the depth at which the views show it.
 
         Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
-        away looks the same, from where the cloud has it, too, and the most probable fit counts.
+        away looks the same, from where the cloud has it, too, and the most probable fit counts. Where edges are
+        displaced the width tells little: there the radius is left to them, too.
         """
         start, depth_sigma = proposal.cylinder, proposal.depth_sigma
         if depth_sigma <= DEPTH_SIGMA * start.radius:
@@ -85,7 +86,12 @@ class LineFitter:
         centre = mean_centre(start, self.views)
         at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, False)
         rough = [(start, min(depth_sigma, DEPTH_REACH))] + ([] if at_depth is None else [(at_depth, LINE_DEPTH_SIGMA)])
-        starts = [Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True) for each, sigma in rough]
+        held = (True, False) if self.displaced else (True,)
+        starts = [
+            Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=fixed)
+            for each, sigma in rough
+            for fixed in held
+        ]
         located = [self._refined(each, known) for each in starts]
         # The known direction is evidence once: the fit has drawn the axis from it as far as the views did.
         again = [
