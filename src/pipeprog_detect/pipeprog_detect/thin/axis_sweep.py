@@ -409,11 +409,11 @@ def _at_best_depth(
         x, y = place[v, 0] + away * across, place[v, 1] + away * up
         low = place[v, 2] + 0.5 * (least + most) * away - LONGEST
         at = (x, y, low, STRETCH)
-        total, weight = total[:longest], weight[:longest]
-        agreeing, centre_x, centre_y, along = _weigh(at, total, weight, place, size, edges, reach, odds, radius)
+        gains, views = total[:longest], weight[:longest]
+        agreeing, centre_x, centre_y, along = _weigh(at, gains, views, place, size, edges, reach, odds, radius)
         for each in range(IN_LINE):
-            best, begin, end = _best_run(total, weight)
-            total[begin:end] = -np.inf
+            best, begin, end = _best_run(gains, views)
+            gains[begin:end] = -np.inf
             row = result[k * IN_LINE + each]
             row[_ODDS] = best * STRETCH / (COLUMNS * place[v, 6] * away)
             row[_X], row[_Y], row[_SIGMA], row[_VIEWS] = x, y, sigma, agreeing

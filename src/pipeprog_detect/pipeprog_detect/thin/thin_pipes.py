@@ -101,7 +101,7 @@ class _Search:
     def along_known_pipes(self, views: Sequence[View], swept: Sequence[View], again: Sequence[View] = ()) -> None:
         """Those along the directions of the known pipes that views show, of which the `swept` ones are looked through.
 
-        What these are certain of is measured `again` in others: its radius is told by both, all else by the more probable.
+        What these are certain of is measured `again` in others: both tell its radius, the more probable fit all else.
         """
         lines = self._fitter(views, DISPLACED if again else 0.0)
         proposals = propose_parallel(swept, parallel_directions(self.known), self.radii, self.known)

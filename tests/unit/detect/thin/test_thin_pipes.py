@@ -14,7 +14,7 @@ from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.thin.line_fitter import LineFitter
-from pipeprog_detect.thin.thin_pipes import find_thin_pipes, is_shadow, turned_parallel
+from pipeprog_detect.thin.thin_pipes import _of_both, _Search, find_thin_pipes, is_shadow, turned_parallel
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -23,6 +23,8 @@ from sitegen.site import CONCRETE
 from tests.unit.detect.pipe_and_wall import front_points
 from tests.unit.detect.rendered_site import walk_past
 from tests.unit.detect.straight_ahead import level, looking_along_y
+
+BOQ = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
 
 
 def measured(cylinder: Cylinder, log_odds: float) -> MeasuredPipe:
@@ -47,11 +49,10 @@ def test_a_thin_pipe_is_turned_parallel_to_others_where_that_is_more_probable(
         return [each.fit for odds in (80.0, log_odds) if (each := measured(start, odds)).fit is not None]
 
     monkeypatch.setattr(LineFitter, "in_direction", fits)
-    boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     views: list[View] = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     beside = [measured(Cylinder(each.start, each.end, 0.05), 100.0) for each in (level(1.0), level(2.0), level(3.0))]
     given_pipes = [*beside, measured(level(0.7, np.radians(degrees)), 100.0)]
-    *others, after = turned_parallel(given_pipes, np.zeros((0, 3)), 0.02, views, boq)
+    *others, after = turned_parallel(given_pipes, np.zeros((0, 3)), 0.02, views, BOQ)
     assert others == beside  # thick ones stay
     assert (after is not given_pipes[-1]) is is_turned
     if is_turned:
@@ -67,6 +68,32 @@ def test_two_pipes_cannot_lie_within_each_other(apart: float, shadow: bool) -> N
     assert not is_shadow(level(0.35, turn=np.radians(30.0)).shifted(np.array([0.0, 0.01, 0.0])), [level(1.6)])
 
 
+def test_only_what_looks_like_a_known_pipe_is_its_rival() -> None:
+    """One in line with it, beyond its end, is another pipe, however short the gap."""
+    views: list[View] = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    known = level(1.0)
+    tree = octree.build(np.zeros((1, 3)))
+    search = _Search(np.zeros((1, 3), np.float32), SceneContext(tree, None, [], tree, 1e-3), 0.03, [], BOQ, [known])
+    thin = replace(known.cut(0.0, 0.5), radius=0.0086)
+    assert search._is_rival(thin, views)
+    assert search._is_rival(thin.shifted(np.array([0.0, 0.05, 0.0])), views)  # its depth is what is known worst
+    beyond = thin.shifted((known.length + 0.01) * known.axis)
+    assert not search._is_rival(beyond, views)
+    assert not search._is_rival(thin.shifted(np.array([0.0, 0.0, 0.1])), views)
+
+
+def test_both_kinds_of_images_tell_the_radius() -> None:
+    one, other = (
+        measured(replace(level(1.0), radius=radius), odds).fit for radius, odds in ((8e-3, 90.0), (9e-3, 70.0))
+    )
+    assert one is not None
+    assert other is not None
+    both = _of_both(replace(one, radius_sigma=1e-4), replace(other, radius_sigma=2e-4))
+    assert both.log_odds == 90.0
+    assert both.cylinder.radius == pytest.approx(8.2e-3)  # weights of 4 to 1
+    assert both.radius_sigma == pytest.approx(1e-4 * np.sqrt(0.8))
+
+
 def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour() -> None:
     """Grey shows the wall as it is without the pipe."""
     copper = replace(CONCRETE, name="copper", colour=(0.75, 0.41, 0.12))
@@ -78,11 +105,10 @@ def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour() -> None:
     wall = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     cloud, tree = np.vstack([wall, front_points(pipe)]), octree.build(wall)
     around = SceneContext(tree, None, [Plane(np.array([0.0, -1.0, 0.0]), 0.0, 4.5)], tree, 1e-3)
-    boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     above = [Cylinder(np.array([-1.0, y, 3.0]), np.array([1.0, y, 3.0]), 0.05) for y in (-0.1, -0.3, -0.5)]
     known = [measured(each, 100.0) for each in above]
-    assert find_thin_pipes(cloud, around, 0.02, known, grey, boq, {}) == []
-    (found,) = find_thin_pipes(cloud, around, 0.02, known, views, boq, {})
+    assert find_thin_pipes(cloud, around, 0.02, known, grey, BOQ, {}) == []
+    (found,) = find_thin_pipes(cloud, around, 0.02, known, views, BOQ, {})
     ends = np.stack([found.cylinder.start, found.cylinder.end])
     assert np.linalg.norm(pipe.from_axis(ends), axis=1).max() < 0.003
     assert found.cylinder.length == pytest.approx(pipe.length, abs=0.02)
