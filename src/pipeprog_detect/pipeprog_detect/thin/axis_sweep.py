@@ -37,9 +37,9 @@ NEAREST = 0.3
 STEP_ROWS, BASELINE = 2.0, 1.5
 # Evidence is gathered in stretches of this length [m], shorter than a clamp, up to this far from a line's middle [m].
 STRETCH, LONGEST = 0.05, 3.0
-# A pipe shows its edges about as often all along. Less than half as often as its clearer quarter does is something else
-# in line with it, which ends it with these log odds (a hundred to one), and where that is more than two clear stretches
-# would make good: no clamp ends it.
+# A pipe shows its edges about as often all along. What has less than half of the log odds, per view, of its clearer
+# quarter is something else in line with it. It ends the pipe where it has lost these log odds by that (a hundred to
+# one), and more than two stretches cost (0.64 of a clear one each): no clamp ends it.
 LEVEL, CLEARER, ENDED, CLAMPED = 0.5, 75.0, float(np.log(100.0)), 1.5
 # Pipes in one line within that reach: of three in a rack, end to end, the middle one's line shows both others.
 IN_LINE = 3
