@@ -166,7 +166,9 @@ class LineFitter:
         if fit is None or not self.displaced:
             return fit
         gain = float(np.median(ViewArrays.of(self.views).pixels_per_metre(fit.cylinder.middle)))
-        return replace(fit, radius_sigma=float(np.hypot(fit.radius_sigma, self.displaced / gain)))
+        covariance = fit.covariance.copy()
+        covariance[4, 4] += (self.displaced / gain) ** 2
+        return replace(fit, covariance=covariance, radius_sigma=float(np.sqrt(covariance[4, 4])))
 
     def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], least: tuple[float, float]) -> bool:
         """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does.

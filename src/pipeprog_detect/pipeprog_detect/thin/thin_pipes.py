@@ -229,8 +229,9 @@ def _of_both(one: ContourFit, other: ContourFit) -> ContourFit:
     weights = 1.0 / np.array([one.radius_sigma, other.radius_sigma]) ** 2
     radius = float(np.average([one.cylinder.radius, other.cylinder.radius], weights=weights))
     probable = max(one, other, key=lambda fit: fit.log_odds)
-    cylinder = replace(probable.cylinder, radius=radius)
-    return replace(probable, cylinder=cylinder, radius_sigma=float(1.0 / np.sqrt(weights.sum())))
+    cylinder, sigma = replace(probable.cylinder, radius=radius), float(1.0 / np.sqrt(weights.sum()))
+    scale = np.diag([1.0, 1.0, 1.0, 1.0, sigma / probable.radius_sigma])
+    return replace(probable, cylinder=cylinder, covariance=scale @ probable.covariance @ scale, radius_sigma=sigma)
 
 
 def _as_candidate(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:

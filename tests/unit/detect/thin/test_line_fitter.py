@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.silhouette.contour_refinement import Start
 from pipeprog_detect.thin import line_fitter
 from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned
@@ -139,3 +140,18 @@ def test_of_a_proposal_that_goes_on_beyond_the_pipe_the_pipe_counts(
     assert found.cylinder.radius == pytest.approx(PIPE.radius, abs=1e-3)
     monkeypatch.setattr(LineFitter, "_parallel", lambda *_: None)
     assert lines.along_known_pipes(Proposal(longer, 2e-3, 50.0), []) is whole
+
+
+def test_displaced_edges_make_the_radius_uncertain_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the fit's covariance as well: what observes the pipe later updates that."""
+    views: list[View] = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    across = np.eye(3)[1:]
+    fit = ContourFit(level(1.0), across, 1e-8 * np.eye(5), 1e-4, 0.9, 50.0, 20, (0.0, 0.0), 0.0, 0.1)
+    monkeypatch.setattr(line_fitter, "refine", lambda *_: fit)
+    lines = LineFitter(views, np.zeros((0, 3), np.float32), [0.0086], BillOfQuantities(()), displaced=0.5)
+    found = lines._refined(Start(level(1.0), 0.0086), [])
+    assert found is not None
+    gain = float(np.median([view.camera.fx / np.linalg.norm(view.centre) for view in views]))
+    assert found.radius_sigma == pytest.approx(np.hypot(1e-4, 0.5 / gain), rel=0.02)
+    assert np.sqrt(found.covariance[4, 4]) == pytest.approx(found.radius_sigma)
+    assert found.covariance[:4, :4] == pytest.approx(1e-8 * np.eye(4))

@@ -88,10 +88,14 @@ def test_both_kinds_of_images_tell_the_radius() -> None:
     )
     assert one is not None
     assert other is not None
-    both = _of_both(replace(one, radius_sigma=1e-4), replace(other, radius_sigma=2e-4))
+    one, other = (
+        replace(fit, radius_sigma=sigma, covariance=sigma**2 * np.eye(5)) for fit, sigma in ((one, 1e-4), (other, 2e-4))
+    )
+    both = _of_both(one, other)
     assert both.log_odds == 90.0
     assert both.cylinder.radius == pytest.approx(8.2e-3)  # weights of 4 to 1
     assert both.radius_sigma == pytest.approx(1e-4 * np.sqrt(0.8))
+    assert np.diag(both.covariance) == pytest.approx([1e-8, 1e-8, 1e-8, 1e-8, both.radius_sigma**2])
 
 
 def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour() -> None:
