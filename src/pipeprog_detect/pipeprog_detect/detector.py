@@ -73,6 +73,7 @@ def detect(
     views: Sequence[View] = (),
     progress: Report | None = None,
     memory: MeasurementCache | None = None,
+    boards: FloatArray | None = None,
 ) -> list[Pipe]:
     """The pipes of a metric cloud: found, measured and classified, in the cloud's frame, sorted by place.
 
@@ -84,6 +85,7 @@ def detect(
         progress: called with the share done (0..1) and what is being done.
         memory: what is known from the last map of this survey: what has not changed is not measured again. It is
             brought up to this map.
+        boards: points (M, 3) of the boards' faces in the cloud's frame: what they hide from a view is not missing.
 
     Raises:
         InputError: no point is finite, or the points are no N x 3 array.
@@ -93,7 +95,7 @@ def detect(
     if config.concave:
         measured = detect_inside(prepared, boq, config, report)
     else:
-        measured = detect_outside(prepared, boq, config, views, report, memory)
+        measured = detect_outside(prepared, boq, config, views, report, memory, boards)
     report(1.0, "done")
     return _product(measured, boq, prepared.shift, config)
 
@@ -141,11 +143,13 @@ def detect_outside(
     views: Sequence[View],
     report: Report,
     memory: MeasurementCache | None,
+    boards: FloatArray | None,
 ) -> list[MeasuredPipe]:
     """The pipes of a room: candidates of the cloud, verified and measured in the views, and thin ones of the views."""
     shift, around = prepared.shift, prepared.around
     local_views = [replace(view, camera_from_map=_moved(view.camera_from_map, shift)) for view in views]
-    judging = with_depths(local_views, prepared.points) if config.contour.enabled else []
+    faces = None if boards is None else boards - shift
+    judging = with_depths(local_views, prepared.points, faces) if config.contour.enabled else []
     verifier = KeyframeVerifier(judging, boq, memory)
     candidates = _candidates(prepared, boq, config, verifier, report, memory)
     report(0.9, "measuring in the keyframes" if views else "measuring")

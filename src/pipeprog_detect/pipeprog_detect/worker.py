@@ -24,6 +24,7 @@ from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import asks_look
 from pipeprog_detect.product.pipe_tracker import PipeTracker
 from pipeprog_detect.product.product import Product, product_of
+from pipeprog_detect.silhouette.board_faces import board_faces
 from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 
@@ -59,7 +60,7 @@ class Map:
     """Command: detect in this map; poses (M, 4, 4) map_from_camera and velocities belong to stamps (M,).
 
     What is found in a `final` map does not depend on the maps before it. A `camera` replaces that of all keyframes.
-    `circles` of the boards tell what is white.
+    `circles` of the boards tell what is white, and what the boards hide.
     """
 
     revision: int
@@ -143,7 +144,11 @@ def serve(
             memory.novelty = MapChange()
         normals = None if command.normals is None else command.normals.astype(float)
         try:
-            pipes = detect(Cloud(command.points.astype(float), normals), boq, config, views, memory=memory)
+            cloud, boards = (
+                Cloud(command.points.astype(float), normals),
+                board_faces(command.circles.centres, command.circles.radii),
+            )
+            pipes = detect(cloud, boq, config, views, memory=memory, boards=boards)
         except InputError as error:
             connection.send(NoPipes(command.revision, str(error)))
             continue

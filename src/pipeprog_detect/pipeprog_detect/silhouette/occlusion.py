@@ -31,9 +31,16 @@ BEFORE = 0.03
 MARGIN = 3.0
 
 
-def with_depths(views: Sequence[View], points: NDArray[np.floating]) -> list[View]:
-    """The views, each with what the cloud's points (N, 3) show of the depth of the nearest surface."""
+def with_depths(
+    views: Sequence[View], points: NDArray[np.floating], faces: NDArray[np.floating] | None = None
+) -> list[View]:
+    """The views, each with what the cloud's points (N, 3) show of the depth of the nearest surface.
+
+    `faces`: points (M, 3) of surfaces that the cloud may not show (`board_faces`).
+    """
     some = np.ascontiguousarray(points[:: max(-(-len(points) // MOST_POINTS), 1)], np.float32)
+    if faces is not None:
+        some = np.vstack([some, faces.astype(np.float32)])
 
     def seen(view: View) -> View:
         camera = view.camera
