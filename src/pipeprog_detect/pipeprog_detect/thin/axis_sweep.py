@@ -254,8 +254,7 @@ def _weigh(
     see `_Stack`, and `_lines` for `odds` (V, W, 2).
     """
     x, y, low, step = at
-    seen = weight
-    total[:], seen[:] = 0.0, 0.0
+    total[:], weight[:] = 0.0, 0.0
     agreeing, centre_x, centre_y, centre_along = 0, 0.0, 0.0, 0.0
     for v in range(len(place)):
         dx, dy = x - place[v, 0], y - place[v, 1]
@@ -280,15 +279,15 @@ def _weigh(
                 continue
             gain = odds[v, width, 0] if first == EDGE and second == EDGE else odds[v, width, 1]
             total[b] += gain
-            seen[b] += 1.0
+            weight[b] += 1.0
             own += gain
         if own > 0.0:
             agreeing += 1
             centre_x, centre_y = centre_x + place[v, 0], centre_y + place[v, 1]
             centre_along += place[v, 2]
     for b in range(len(total)):
-        alike = 1.0 + COMMON * max(seen[b] - 1.0, 0.0)
-        total[b], weight[b] = total[b] / alike, seen[b] / alike
+        alike = 1.0 + COMMON * max(weight[b] - 1.0, 0.0)
+        total[b], weight[b] = total[b] / alike, weight[b] / alike
     share = 1.0 / max(agreeing, 1)
     return agreeing, share * centre_x, share * centre_y, share * centre_along
 
