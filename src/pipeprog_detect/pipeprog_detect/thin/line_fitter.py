@@ -111,9 +111,8 @@ class LineFitter:
         starts = [
             Start(start, start.radius, True, depth_sigma, PARALLEL_SIGMA, radius_fixed=fixed) for fixed in (False, True)
         ]
-        fits = [self._refined(each, known) for each in starts]
-        seen = [fit for fit in fits if fit is not None]
-        good = (fit for fit in seen if self._accepts(fit, known, PARALLEL_CONVINCING))
+        fits = (self._refined(each, known) for each in starts)
+        good = (fit for fit in fits if fit is not None and self._accepts(fit, known, PARALLEL_CONVINCING))
         return next(good, None)
 
     def again(self, fit: ContourFit, known: Sequence[Cylinder]) -> ContourFit | None:
