@@ -159,7 +159,7 @@ def _are_on(cylinders: Sequence[Cylinder], points: NDArray[np.float32], clearanc
 
 def _beside(
     cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray
-) -> tuple[int, NDArray[np.int64], NDArray[np.floating], NDArray[np.floating], NDArray[np.int64]]:
+) -> tuple[int, NDArray[np.int64], FloatArray, FloatArray, NDArray[np.int64]]:
     """The cloud's points (N, 3) that `centre` sees along a cylinder, no farther from its depth than `DEPTH_REACH`.
 
     Number of bins along it; bin (M,), distance from the axis in the image, at its depth (M,) [m], depth (M,) [m], and
@@ -173,22 +173,42 @@ def _beside(
 
 def seen_along(
     cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray, reach: tuple[float, float]
-) -> tuple[NDArray[np.int64], NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
     """The cloud's points (N, 3) that `centre` sees along a cylinder, between `reach` [m] behind it (less: before it).
 
     Row among the points (M,), position along the cylinder and distance from its axis in the image, both at its depth,
     and depth (M,) [m].
     """
-    axis, towards, side = _sight(cylinder, centre)
-    depth = float((cylinder.start - centre) @ towards)
-    offset = points - centre.astype(np.float32)
-    far = offset @ towards.astype(np.float32)
-    near = (far - depth > reach[0]) & (far - depth < reach[1]) & (far > 0)
-    offset, far = offset[near], far[near]
-    place = (offset @ axis.astype(np.float32)) * depth / far - float((cylinder.start - centre) @ axis)
-    aside = (offset @ side.astype(np.float32)) * depth / far
-    along = (place > 0) & (place < cylinder.length)
-    return np.flatnonzero(near)[along], place[along], aside[along], far[along]
+    sight, start = np.stack(_sight(cylinder, centre)), cylinder.start - centre
+    return _seen_along(points, centre, sight, start, cylinder.length, reach)
+
+
+@njit(cache=True, nogil=True)
+def _seen_along(
+    points: NDArray[np.float32],
+    centre: FloatArray,
+    sight: FloatArray,
+    start: FloatArray,
+    length: float,
+    reach: tuple[float, float],
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+    """See `seen_along`; `sight` (3, 3): what `_sight` gives, `start` (3,): the cylinder's, from `centre` on [m]."""
+    axis, towards, side = sight
+    depth, first = (start * towards).sum(), (start * axis).sum()
+    row = np.empty(len(points), np.int64)
+    seen = np.empty((3, len(points)))
+    count = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        far = x * towards[0] + y * towards[1] + z * towards[2]
+        if not (far > 0.0 and reach[0] < far - depth < reach[1]):
+            continue
+        place = (x * axis[0] + y * axis[1] + z * axis[2]) * depth / far - first
+        if 0.0 < place < length:
+            aside = (x * side[0] + y * side[1] + z * side[2]) * depth / far
+            row[count], seen[0, count], seen[1, count], seen[2, count] = i, place, aside, far
+            count += 1
+    return row[:count].copy(), seen[0, :count].copy(), seen[1, :count].copy(), seen[2, :count].copy()
 
 
 @njit(cache=True, nogil=True)
