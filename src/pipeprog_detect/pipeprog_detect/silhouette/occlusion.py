@@ -129,19 +129,18 @@ def _passing(
     for i in range(count):
         deepest = max(deepest, own_depth[i])
     for k in range(len(cylinders)):
-        ax, ay, az, length, radius = cylinders[k, 3:8]
-        x, y, z = cylinders[k, 0] - centre[0], cylinders[k, 1] - centre[1], cylinders[k, 2] - centre[2]
-        nearest = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
-        run = length * (rotation[2, 0] * ax + rotation[2, 1] * ay + rotation[2, 2] * az)
-        reach = radius + margin * deepest
-        if max(nearest, nearest + run) < -2.0 * reach or min(nearest, nearest + run) > deepest + 2.0 * reach:
-            continue  # all of it, grown as far as it can be, behind the camera or behind the points
-        before = ax * x + ay * y + az * z
-        x, y, z = x - before * ax, y - before * ay, z - before * az
+        axis, offset, before = _straight_to(cylinders[k], centre)
+        length, radius = cylinders[k, 6], cylinders[k, 7]
+        # A place within reach of the axis, and as far beyond its ends, is nearer to it than 1.5 reaches.
+        grown = 1.5 * (radius + margin * deepest)
+        left, right, top, bottom = _image_box(cylinders[k], grown, centre, rotation, lens, deepest)
+        if left > right:
+            continue
         for i in range(count):
-            if result[i]:
+            u, v = pixel[i, 0], pixel[i, 1]
+            if result[i] or u < left or u > right or v < top or v > bottom:
                 continue
-            depth, along, square = _approach(rays[i], (ax, ay, az), (x, y, z))
+            depth, along, square = _approach(rays[i], axis, offset)
             if depth <= 0.0 or depth >= own_depth[i]:
                 continue
             reach = radius + margin * depth
@@ -185,7 +184,13 @@ def _first_met(
     for k in range(len(cylinders)):
         axis, offset, before = _straight_to(cylinders[k], centre)
         length, radius = cylinders[k, 6], cylinders[k, 7]
+        left, right, top, bottom = _image_box(cylinders[k], radius, centre, rotation, lens, np.inf)
+        if left > right:
+            continue
         for i in range(count):
+            u, v = pixel[i, 0], pixel[i, 1]
+            if u < left or u > right or v < top or v > bottom:
+                continue
             depth, along, square = _approach(rays[i], axis, offset)
             if depth <= 0.0 or square >= radius * radius:
                 continue
@@ -194,6 +199,38 @@ def _first_met(
             if depth > 0.0 and 0.0 < depth * along - before < length:
                 result[i] = min(result[i], depth)
     return result
+
+
+@njit(cache=True, nogil=True)
+def _image_box(
+    cylinder: FloatArray, reach: float, centre: FloatArray, rotation: FloatArray, lens: FloatArray, deepest: float
+) -> tuple[float, float, float, float]:
+    """Bounds [px] (left, right, top, bottom) of all that is within `reach` [m] of a cylinder's (8,) axis.
+
+    The image of a convex body before the camera lies in the bounds of what spans it: the boxes around both ends. Where
+    a part of the body is not before the camera there are none; they hold nothing where it lies behind the camera, or
+    behind the depth `deepest` [m].
+    """
+    left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
+    least, most = np.inf, -np.inf
+    for end in range(2):
+        run = end * cylinder[6]
+        x = cylinder[0] + run * cylinder[3] - centre[0]
+        y = cylinder[1] + run * cylinder[4] - centre[1]
+        z = cylinder[2] + run * cylinder[5] - centre[2]
+        u = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+        v = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        least, most = min(least, depth), max(most, depth)
+        for surface in (depth - reach, depth + reach):
+            far = max(surface, NEAR_PLANE)
+            left, right = min(left, (u - reach) / far), max(right, (u + reach) / far)
+            top, bottom = min(top, (v - reach) / far), max(bottom, (v + reach) / far)
+    if most + reach < 0.0 or least - reach > deepest:
+        return np.inf, -np.inf, np.inf, -np.inf
+    if least - reach < NEAR_PLANE:
+        return -np.inf, np.inf, -np.inf, np.inf
+    return lens[0] * left + lens[2], lens[0] * right + lens[2], lens[1] * top + lens[3], lens[1] * bottom + lens[3]
 
 
 @njit(cache=True, nogil=True, inline="always")
