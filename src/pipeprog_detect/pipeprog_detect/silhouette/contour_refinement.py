@@ -119,9 +119,8 @@ def refine(
 
 def _first_steps(start: Start, scene: Scene, planned_radii: Sequence[float]) -> tuple[FloatArray, FloatArray] | None:
     """Candidate steps (K, 5), best first, and the precision (5, 5) of the start; None where too little is seen."""
-    samples = scene.samples()
+    samples = scene.samples(limit=MOST_SAMPLES)
     if len(np.unique(samples.view)) >= 2 and samples.shows_both_sides():
-        samples = samples.thinned(MOST_SAMPLES)
         reach, furthest = _search_range(start, float(np.median(samples.gain)), float(samples.gain.max()))
         near = [value - start.cylinder.radius for value in planned_radii]
         near = [value for value in near if abs(value) < reach[4]]

@@ -151,7 +151,7 @@ def _turned(known: AdjustedCylinder, held: FloatArray) -> Scene | None:
         return None
     longer = Cylinder(cylinder.start - further, cylinder.end + further, cylinder.radius)
     ahead = replace(known.scene, cylinder=longer)
-    samples = ahead.samples().thinned(MOST_SAMPLES)
+    samples = ahead.samples(limit=MOST_SAMPLES)
     if not len(samples):
         return None
     furthest = reach.max() * float(samples.gain.max())

@@ -32,6 +32,9 @@ from pipeprog_detect.types import Cylinder, View
 
 # Length of contour [px] that makes one measurement: the mean over it averages texture, the line stays straight within.
 SPACING = 12
+# Where a limited number of samples is wanted, this many times as many are tried: a pipe of which others hide three
+# quarters still gives all.
+MOSTLY_HIDDEN = 4
 # The limb model's window outside the pipe, where the next thing may begin: this width [px], and three blurs.
 OUTWARD, OUTWARD_OF_BLUR = 1.5, 3.0
 # Distance of the light's samples across the contour [px]: half of what an image resolves.
@@ -101,10 +104,13 @@ class Scene:
         reach = min(reach, max(THIN_REACH * self.cylinder.radius * float(np.median(gains)), LEAST_REACH))
         return TRIAL_STEP * round(reach / TRIAL_STEP)
 
-    def samples(self, spacing: int = SPACING, margin: float = 4.0) -> ContourSamples:
-        """Samples of the cylinder's contour, about `spacing` [px] apart, that nothing hides."""
+    def samples(self, spacing: int = SPACING, margin: float = 4.0, limit: int | None = None) -> ContourSamples:
+        """Samples of the cylinder's contour, about `spacing` [px] apart, that nothing hides; `limit` at the most."""
         samples = contour_samples(self.cylinder, self.views, self.basis, spacing, margin)
-        return samples.select(visible(samples, self.cylinder, self.views, self.others))
+        if limit is not None:
+            samples = samples.thinned(MOSTLY_HIDDEN * limit)
+        samples = samples.select(visible(samples, self.cylinder, self.views, self.others))
+        return samples if limit is None else samples.thinned(limit)
 
     def visible_share(self) -> float:
         """Share (0 to 1) of the positions along the cylinder, within the images, at which nothing hides its contour."""
@@ -188,9 +194,7 @@ class Scene:
         self, reach: float, spacing: int, limit: int | None
     ) -> tuple[ContourSamples, FloatArray, NDArray[np.float32]]:
         """Visible samples, offsets (Q,) [px] and light (N, Q) there, from where the views' offsets put the contour."""
-        samples = self.samples(spacing, margin=INWARD)
-        if limit is not None:
-            samples = samples.thinned(limit)
+        samples = self.samples(spacing, INWARD, limit)
         inward = INWARD
         if len(samples):
             inward = min(INWARD, WINDOW_OF_HALF_WIDTH * float(np.median(samples.half_width)))
