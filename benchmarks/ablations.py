@@ -81,7 +81,7 @@ STAGES = {
     "without the normal gate": Stage(patches=NO_GATE),
     "without contours (cloud alone)": Stage(CLOUD_ALONE),
     "without contours and the normal gate": Stage(CLOUD_ALONE, NO_GATE),
-    "without rims": Stage(patches=(("pipeprog_detect.silhouette.pipe_ends.find_end", _no_end),)),
+    "without rims": Stage(patches=(("pipeprog_detect.refinement.pipe_ends.find_end", _no_end),)),
     "without the posterior (k-means)": Stage(replace(DetectConfig(), classifier="kmeans")),
 }
 ECCENTRICITY, FEEDBACK = "without the correction for eccentricity", "without feedback"

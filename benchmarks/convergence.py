@@ -33,7 +33,7 @@ from pipeprog_detect.cloud import local_shape, octree, plane_segmentation
 from pipeprog_detect.cloud.axis_voting import Hypothesis
 from pipeprog_detect.cloud.candidate import Candidate, fit_candidate
 from pipeprog_detect.cloud.cylinder_fit import basis
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.types import Cylinder, View
 
 sys.path.insert(0, str(ROOT / "bags"))

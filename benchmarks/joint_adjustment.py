@@ -29,8 +29,8 @@ from pipeprog_bringup.results.truth_alignment import align
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
+from pipeprog_detect.refinement.contour_adjustment import FLOOR, MODEL_ERROR, ROBUST, AdjustedCylinder, adjusted
 from pipeprog_detect.silhouette.apparent_contour import parts_by_view
-from pipeprog_detect.silhouette.contour_adjustment import FLOOR, MODEL_ERROR, ROBUST, AdjustedCylinder, adjusted
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene

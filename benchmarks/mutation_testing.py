@@ -98,13 +98,13 @@ MUTANTS = {
         "pipeprog_detect.silhouette.apparent_contour.project",
         "return pixel, depth",
         "return pixel + 0.5, depth",
-        "detect/silhouette/test_pipe_ends.py",
+        "detect/refinement/test_pipe_ends.py",
     ),
-    "silhouette: no end from rims": Mutant(
-        "pipeprog_detect.silhouette.pipe_ends.find_end",
+    "refinement: no end from rims": Mutant(
+        "pipeprog_detect.refinement.pipe_ends.find_end",
         "    return End(*_refined(",
         "    return None and End(*_refined(",
-        "detect/silhouette/test_pipe_ends.py",
+        "detect/refinement/test_pipe_ends.py",
     ),
     "thin: the axis behind the nearest points by a diameter": Mutant(
         "pipeprog_detect.thin.depth_from_cloud.at_cloud_depth",

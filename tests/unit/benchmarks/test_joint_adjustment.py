@@ -9,8 +9,8 @@ import pytest
 from benchmarks.joint_adjustment import Outline, image_error, moved, pose_motions
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_detect.refinement.contour_adjustment import AdjustedCylinder
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples, contour_samples
-from pipeprog_detect.silhouette.contour_adjustment import AdjustedCylinder
 from pipeprog_detect.silhouette.limb_edges import LimbEdges
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View

@@ -17,7 +17,7 @@ from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable
 from pipeprog_detect.verification.scene_context import SceneContext

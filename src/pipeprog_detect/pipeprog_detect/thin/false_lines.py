@@ -11,9 +11,9 @@ from scipy.ndimage import uniform_filter1d
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.refinement.axial_evidence import STEP_AT
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
-from pipeprog_detect.silhouette.axial_evidence import STEP_AT
-from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.edge_support import COMMON
 from pipeprog_detect.silhouette.scene import SPACING, Scene
 from pipeprog_detect.thin.depth_from_cloud import is_edge_of_face, seen_along

@@ -13,10 +13,10 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.acceptance import VAGUEST
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
+from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_refinement import Start, refine
+from pipeprog_detect.refinement.extension import HIDDEN, where_seen
 from pipeprog_detect.silhouette.apparent_contour import ViewArrays
-from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.extension import HIDDEN, where_seen
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, mean_centre

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.silhouette.chromaticity import DISPLACED
-from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.thin.axis_sweep import SAME_LINE, propose_parallel
 from pipeprog_detect.thin.corners import is_corner

@@ -11,9 +11,9 @@ import numpy as np
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import is_planned
-from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.one_sided import SeenArc, with_radius
+from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_refinement import Start, refine
+from pipeprog_detect.refinement.one_sided import SeenArc, with_radius
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question

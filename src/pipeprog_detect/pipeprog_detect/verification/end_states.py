@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeprog_detect.cloud.axial_extent import bin_length
-from pipeprog_detect.silhouette.end_posterior import end_posterior
-from pipeprog_detect.silhouette.extension import LEAST
+from pipeprog_detect.refinement.end_posterior import end_posterior
+from pipeprog_detect.refinement.extension import LEAST
 from pipeprog_detect.types import Cylinder, PipeEnd, View
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import ON_PLANE, planes_ahead

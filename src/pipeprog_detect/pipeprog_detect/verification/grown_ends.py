@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeprog_detect.silhouette.axial_evidence import axial_evidence
-from pipeprog_detect.silhouette.extension import CERTAIN, LEAST
-from pipeprog_detect.silhouette.pipe_ends import find_end
+from pipeprog_detect.refinement.axial_evidence import axial_evidence
+from pipeprog_detect.refinement.extension import CERTAIN, LEAST
+from pipeprog_detect.refinement.pipe_ends import find_end
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe

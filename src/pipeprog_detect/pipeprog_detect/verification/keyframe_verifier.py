@@ -10,12 +10,12 @@ import numpy as np
 
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.product.boq import BillOfQuantities
+from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.refinement.extension import LEAST_STUB
+from pipeprog_detect.refinement.one_sided import only_visible_side
 from pipeprog_detect.silhouette.apparent_contour import views_showing
-from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
-from pipeprog_detect.silhouette.extension import LEAST_STUB
 from pipeprog_detect.silhouette.free_space import free_stretches
-from pipeprog_detect.silhouette.one_sided import only_visible_side
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.cloud.collinear import join, spanning
-from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.free_space import SHORTEST, free_stretches
 from pipeprog_detect.silhouette.scene import Scene

@@ -12,8 +12,8 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_detect.cloud.collinear import near
 from pipeprog_detect.cloud.map_change import MapChange
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.silhouette.apparent_contour import in_image
-from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.types import Cylinder, View
 
 # A candidate is the same while its ends move by less than the cloud's own scatter [m] and a share of its radius, and

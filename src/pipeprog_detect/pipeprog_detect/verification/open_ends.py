@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.refinement.axial_evidence import FARTHEST, axial_evidence
+from pipeprog_detect.refinement.extension import CERTAIN, LEAST, MAX_EXTENSIONS
 from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
-from pipeprog_detect.silhouette.axial_evidence import FARTHEST, axial_evidence
-from pipeprog_detect.silhouette.extension import CERTAIN, LEAST, MAX_EXTENSIONS
 from pipeprog_detect.silhouette.free_space import MIN_VIEWS, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeprog_detect.cloud.candidate import Candidate
-from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_fit import ContourFit
 
 # They contradict each other where they differ by more than this many standard deviations, the cloud's noise included,
 # and agree where they differ by less than this many without it (one in twenty pipes is beyond that).

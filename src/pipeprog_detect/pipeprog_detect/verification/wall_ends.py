@@ -11,8 +11,8 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.refinement.axial_evidence import axial_evidence
 from pipeprog_detect.silhouette.apparent_contour import views_showing
-from pipeprog_detect.silhouette.axial_evidence import axial_evidence
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View

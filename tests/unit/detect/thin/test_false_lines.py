@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.silhouette.apparent_contour import contour_samples
-from pipeprog_detect.silhouette.contour_fit import ContourFit
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.thin import false_lines
 from pipeprog_detect.thin.false_lines import is_bare, is_false_line, is_one_step, is_strip_of_light

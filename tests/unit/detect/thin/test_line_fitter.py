@@ -9,8 +9,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.silhouette.contour_refinement import Start
+from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_refinement import Start
 from pipeprog_detect.thin import line_fitter
 from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned

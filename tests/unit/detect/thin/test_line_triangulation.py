@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.contour_fit import FLAT, SURELY
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.refinement.contour_fit import FLAT, SURELY
+from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.thin.line_segments import segment_pairs, straight_edges
 from pipeprog_detect.thin.line_triangulation import propose
 from pipeprog_detect.thin.pair_views import pair_views

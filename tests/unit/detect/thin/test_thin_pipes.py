@@ -12,7 +12,7 @@ from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.thin.line_fitter import LineFitter
 from pipeprog_detect.thin.thin_pipes import _of_both, _Search, find_thin_pipes, is_shadow, turned_parallel
 from pipeprog_detect.types import Cylinder, View

@@ -10,8 +10,8 @@ import pytest
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.silhouette.contour_fit import ContourFit
-from pipeprog_detect.silhouette.one_sided import SeenArc, with_radius
+from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.refinement.one_sided import SeenArc, with_radius
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification import candidate_fit, radius_agreement

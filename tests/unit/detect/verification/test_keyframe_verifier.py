@@ -12,7 +12,7 @@ from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.config import ContourConfig, DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
-from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CandidateFitter
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
-from pipeprog_detect.silhouette.extension import CERTAIN, LEAST
+from pipeprog_detect.refinement.extension import CERTAIN, LEAST
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from pipeprog_detect.verification.open_ends import with_open_ends

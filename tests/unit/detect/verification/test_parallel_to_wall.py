@@ -14,7 +14,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.cloud.plane_segmentation import Plane
-from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from pipeprog_detect.verification.parallel_to_wall import CLIP_SLOPE, HELD_WITHIN, parallel_to_wall

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
-from pipeprog_detect.silhouette.axial_evidence import FARTHEST, AxialEvidence, axial_evidence
-from pipeprog_detect.silhouette.extension import LEAST
-from pipeprog_detect.silhouette.pipe_ends import (
+from pipeprog_detect.refinement.axial_evidence import FARTHEST, AxialEvidence, axial_evidence
+from pipeprog_detect.refinement.extension import LEAST
+from pipeprog_detect.refinement.pipe_ends import (
     MOST_INSIDE,
     OUTSIDE,
     OUTSIDE_RADII,
@@ -23,6 +22,7 @@ from pipeprog_detect.silhouette.pipe_ends import (
     pixel_at,
     rim_strength,
 )
+from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.contour_adjustment import AdjustedCylinder, adjusted, best_of
-from pipeprog_detect.silhouette.contour_fit import ContourFit, contour_fit
+from pipeprog_detect.refinement.contour_adjustment import AdjustedCylinder, adjusted, best_of
+from pipeprog_detect.refinement.contour_fit import ContourFit, contour_fit
+from pipeprog_detect.refinement.extension import RADIUS_HELD, followed, without_bend
+from pipeprog_detect.refinement.global_search import MOST_SAMPLES, best_steps, distinct
+from pipeprog_detect.refinement.one_sided import SeenArc, arc_precision, only_visible_side
+from pipeprog_detect.refinement.pipe_ends import find_ends
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
-from pipeprog_detect.silhouette.extension import RADIUS_HELD, followed, without_bend
-from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps, distinct
-from pipeprog_detect.silhouette.one_sided import SeenArc, arc_precision, only_visible_side
-from pipeprog_detect.silhouette.pipe_ends import find_ends
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.axial_evidence import AxialEvidence
-from pipeprog_detect.silhouette.pipe_ends import (
+from pipeprog_detect.refinement.axial_evidence import AxialEvidence
+from pipeprog_detect.refinement.pipe_ends import (
     AT_ELBOW,
     FATTENED,
     THICKNESS,

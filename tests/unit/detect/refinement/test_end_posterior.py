@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.axial_evidence import AxialEvidence
-from pipeprog_detect.silhouette.end_posterior import EndPosterior, contour_odds, end_posterior
+from pipeprog_detect.refinement.axial_evidence import AxialEvidence
+from pipeprog_detect.refinement.end_posterior import EndPosterior, contour_odds, end_posterior
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.contour_fit import ContourFit
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.types import Cylinder
 
 

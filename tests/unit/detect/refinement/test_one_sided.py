@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
-from pipeprog_detect.silhouette.one_sided import SeenArc, arc_precision, only_visible_side, with_radius
+from pipeprog_detect.refinement.contour_refinement import Start, refine
+from pipeprog_detect.refinement.one_sided import SeenArc, arc_precision, only_visible_side, with_radius
 from pipeprog_detect.silhouette.scene import Scene, frame, viewing_direction
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_detect.silhouette import extension
+from pipeprog_detect.refinement import extension
+from pipeprog_detect.refinement.axial_evidence import BRIGHTER, DARKER, NO_EDGE, _log_odds, axial_evidence
+from pipeprog_detect.refinement.contour_adjustment import adjusted
+from pipeprog_detect.refinement.contour_refinement import Start, refine
+from pipeprog_detect.refinement.extension import extended, without_bend
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples
-from pipeprog_detect.silhouette.axial_evidence import BRIGHTER, DARKER, NO_EDGE, _log_odds, axial_evidence
-from pipeprog_detect.silhouette.contour_adjustment import adjusted
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.edge_support import support_profile
-from pipeprog_detect.silhouette.extension import extended, without_bend
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View

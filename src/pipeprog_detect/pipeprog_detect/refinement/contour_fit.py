@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.contour_adjustment import MODEL_ERROR, ROBUST, AdjustedCylinder, flatness
-from pipeprog_detect.silhouette.pipe_ends import End
+from pipeprog_detect.refinement.contour_adjustment import MODEL_ERROR, ROBUST, AdjustedCylinder, flatness
+from pipeprog_detect.refinement.pipe_ends import End
 from pipeprog_detect.types import Cylinder
 
 # Where the contour is not seen, edges of texture take its place, spread evenly within the robust loss [px].

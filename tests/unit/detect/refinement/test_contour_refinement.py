@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.silhouette.contour_adjustment import LEAST_IN_VIEW, adjusted
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.refinement.contour_adjustment import LEAST_IN_VIEW, adjusted
+from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.silhouette.scene import Scene, frame
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.axial_evidence import FARTHEST, TOLERANCE, AxialEvidence, axial_evidence
-from pipeprog_detect.silhouette.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
+from pipeprog_detect.refinement.axial_evidence import FARTHEST, TOLERANCE, AxialEvidence, axial_evidence
+from pipeprog_detect.refinement.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
+from pipeprog_detect.refinement.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.edge_support import SupportProfile, support_profile
 from pipeprog_detect.silhouette.free_space import free_stretches
-from pipeprog_detect.silhouette.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.types import Cylinder, View
 from sitegen.primitives import Primitive, bend_tangent, box, cylinder, disc, elbow
 from sitegen.site import GALVANISED, PIPE_MATERIALS

@@ -9,9 +9,9 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.silhouette import contour_adjustment, global_search
+from pipeprog_detect.refinement import contour_adjustment, global_search
+from pipeprog_detect.refinement.contour_adjustment import FIRST_OFFSET, FLOOR, LEAST_OFFSET, ROBUST, ROUNDS, WORST_EDGE
 from pipeprog_detect.silhouette.apparent_contour import ContourSamples, ViewArrays, in_image
-from pipeprog_detect.silhouette.contour_adjustment import FIRST_OFFSET, FLOOR, LEAST_OFFSET, ROBUST, ROUNDS, WORST_EDGE
 from pipeprog_detect.silhouette.light_sampling import LINEAR_LIGHT, light_across, light_at
 from pipeprog_detect.silhouette.limb_edges import LimbEdges, least_cost, limb_basis, limb_edges, prior_precision
 from pipeprog_detect.silhouette.occlusion import (

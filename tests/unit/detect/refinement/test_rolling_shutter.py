@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeprog_detect.silhouette.contour_refinement import Start, refine
+from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
-from tests.unit.detect.silhouette.test_contour_refinement import AXIS_TOLERANCE, RADIUS_TOLERANCE
+from tests.unit.detect.refinement.test_contour_refinement import AXIS_TOLERANCE, RADIUS_TOLERANCE
 
 SHORT = Cylinder(PIPE.start + 0.04 * PIPE.axis, PIPE.end - 0.04 * PIPE.axis, 0.95 * PIPE.radius)
 

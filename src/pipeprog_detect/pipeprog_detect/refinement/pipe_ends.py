@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.refinement.axial_evidence import AxialEvidence, axial_evidence
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ViewArrays, project
-from pipeprog_detect.silhouette.axial_evidence import AxialEvidence, axial_evidence
 from pipeprog_detect.silhouette.edge_support import NEAR
 from pipeprog_detect.silhouette.light_sampling import light_at
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, hidden_by_cloud, hidden_by_cylinders
