@@ -98,7 +98,7 @@ FOLDERS = {
     },
 }
 LICENCE = "# SPDX-License-Identifier: Apache-2.0"
-SHARED = {"config", "types"}
+SHARED = {"config", "threads", "types"}
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|launch(_ros)?|tf2_ros|ament_index_python")
 
 # Import name -> dependency in package.xml; None: no rosdep key, requirements.txt installs it.

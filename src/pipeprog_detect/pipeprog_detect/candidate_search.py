@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -20,7 +19,8 @@ from pipeprog_detect.cloud.collinear import elbows, join, near, spanning
 from pipeprog_detect.cloud.cutting_planes import CuttingPlane, place_planes, section_hypotheses
 from pipeprog_detect.cloud.local_shape import Surfaces
 from pipeprog_detect.cloud.octree import Octree
-from pipeprog_detect.config import THREADS, DetectConfig
+from pipeprog_detect.config import DetectConfig
+from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -225,9 +225,7 @@ class Search:
         """
         for again in (False, True):
             joined = join([candidate.cylinder for candidate in accepted])
-            # Most of it is compiled, and lets other threads run.
-            with ThreadPoolExecutor(THREADS) as pool:
-                measured = list(pool.map(partial(self._refit, accepted, again), joined))
+            measured = mapped(partial(self._refit, accepted, again), joined)
             accepted = [candidate for candidate in measured if candidate is not None]
         bends = elbows([candidate.cylinder for candidate in accepted])
         return [candidate for number, candidate in enumerate(accepted) if number not in bends]

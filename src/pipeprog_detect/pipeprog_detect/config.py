@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the detector, one dataclass per stage; DetectConfig holds them all. And how many threads it has."""
+"""Settings of the detector, one dataclass per stage; DetectConfig holds them all."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 
 from pipeprog_camera.setting_field import cores_setting, setting
-
-# Threads for loops over independent parts; what they give does not depend on it. Linux alone tells a process's cores.
-THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.false_lines import is_false_line, is_one_step
 from pipeprog_detect.thin.hangers import is_hanger
 from pipeprog_detect.thin.thin_pipes import find_thin_pipes, in_colour, turned_parallel
+from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.grown_ends import with_grown_ends
@@ -248,11 +249,13 @@ def _judged(
     if not views:
         return measured
     cylinders = [each.cylinder for each in measured]
-    return [
-        each
-        for number, each in enumerate(measured)
-        if each.cylinder.radius >= THICKEST_LINE or stands(each, cylinders[:number] + cylinders[number + 1 :])
-    ]
+
+    def one(number: int) -> bool:
+        is_thick = cylinders[number].radius >= THICKEST_LINE
+        return is_thick or stands(measured[number], cylinders[:number] + cylinders[number + 1 :])
+
+    kept = mapped(one, range(len(measured)))
+    return [each for each, is_kept in zip(measured, kept, strict=True) if is_kept]
 
 
 def _abutted(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:
@@ -267,7 +270,7 @@ def _abutted(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
         cylinder = with_ends_on_walls(each.cylinder, each.rims, around, views, others)
         return replace(each, cylinder=cylinder, ends=ends_in_views(cylinder, around, views, others))
 
-    return [one(number) for number in range(len(measured))]
+    return mapped(one, range(len(measured)))
 
 
 def _with_ends_in_cloud(measured: MeasuredPipe) -> MeasuredPipe:

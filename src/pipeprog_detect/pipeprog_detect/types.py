@@ -83,6 +83,11 @@ class Cylinder:
         return (self.end - self.start) / self.length
 
     @cached_property
+    def row(self) -> FloatArray:
+        """Start, axis, length and radius (8,)."""
+        return np.concatenate([self.start, self.axis, [self.length, self.radius]])
+
+    @cached_property
     def middle(self) -> FloatArray:
         """The point (3,) of the axis halfway between the ends [m]."""
         return 0.5 * (self.start + self.end)

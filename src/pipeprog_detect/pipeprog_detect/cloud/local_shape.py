@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,7 +11,7 @@ from numba import njit
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud.octree import Octree, neighbour_ranges
-from pipeprog_detect.config import THREADS
+from pipeprog_detect.threads import THREADS, mapped
 
 # A quadric has six coefficients: twice as many points leave something to judge it by.
 _LEAST_POINTS = 12
@@ -75,10 +74,8 @@ def surfaces(tree: Octree, sites: Octree, scale: float, sigma: float) -> Surface
             sites.points[part], own_cells[part], tree.points, cells.keys, cells.starts, level, scale, sigma
         )
 
-    # The compiled loop lets other threads run.
     bounds = np.linspace(0, len(sites.points), THREADS + 1).astype(int)
-    with ThreadPoolExecutor(THREADS) as pool:
-        parts = list(pool.map(fit, [slice(first, last) for first, last in pairwise(bounds)]))
+    parts = mapped(fit, [slice(first, last) for first, last in pairwise(bounds)])
     table, count = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return Surfaces(
         scale,

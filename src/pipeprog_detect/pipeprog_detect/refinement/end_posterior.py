@@ -22,7 +22,7 @@ from pipeprog_detect.refinement.pipe_ends import (
     pixel_at,
     rim_strength,
 )
-from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
+from pipeprog_detect.silhouette.apparent_contour import ViewArrays, views_showing
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 
@@ -79,7 +79,7 @@ def end_posterior(cylinder: Cylinder, at_end: bool, views: Sequence[View], other
     near = max(OUTSIDE, OUTSIDE_RADII * cylinder.radius)
     inside, ahead = min(near, MOST_INSIDE * cylinder.length), min(max(cylinder.length, near), FARTHEST)
     beyond = barrel.end + np.linspace(0.0, ahead, LOOKED_AT)[:, None] * barrel.axis
-    in_view = any(in_image(view, barrel.end[None] + LEAST * barrel.axis).any() for view in views)
+    in_view = bool(ViewArrays.of(views).showing(barrel.end[None] + LEAST * barrel.axis).any())
     looking = (
         views_showing(beyond, views, ENOUGH_VIEWS)
         or views_showing(barrel.at(np.linspace(0.5, 1.0, LOOKED_AT)), views, ENOUGH_VIEWS)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.config import THREADS
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ContourSamples, parts_by_view
+from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 
 # Cells across an image, and points at the most that fill them: 12 in each of the 160 x 90 cells of a view that shows a
@@ -51,8 +50,7 @@ def with_depths(
         nearest = _nearest(some, pose, lens, np.float32(cell), rows, COLUMNS, LEAST_POINTS)
         return replace(view, nearest=np.minimum(nearest, maximum_filter(nearest, footprint=AROUND)))
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(seen, views))
+    return mapped(seen, views)
 
 
 def visible(
@@ -82,8 +80,8 @@ def on_contours(samples: ContourSamples, views: Sequence[View], others: Sequence
 
 
 def cylinder_rows(cylinders: Sequence[Cylinder]) -> FloatArray:
-    """Start, axis, length and radius (K, 8) of cylinders, for `hidden_by_cylinders`."""
-    return np.array([[*each.start, *each.axis, each.length, each.radius] for each in cylinders]).reshape(-1, 8)
+    """The rows (K, 8) of cylinders, for `hidden_by_cylinders`."""
+    return np.stack([each.row for each in cylinders]) if cylinders else np.empty((0, 8))
 
 
 def hidden_by_cylinders(view: View, pixel: FloatArray, depth: FloatArray, cylinders: FloatArray) -> NDArray[np.bool_]:

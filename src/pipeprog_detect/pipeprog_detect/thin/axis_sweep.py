@@ -21,6 +21,7 @@ from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.silhouette.edge_support import COMMON, HIT_RATE, MIN_VIEWS
 from pipeprog_detect.silhouette.occlusion import BEFORE
 from pipeprog_detect.thin.rectified_view import BLOCK, EDGE, UNKNOWN, RectifiedView, rectified_views
+from pipeprog_detect.threads import THREADS, mapped
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import DECISIVE
 
@@ -53,6 +54,8 @@ VAGUEST = 0.3
 SAME_LINE = 1.0
 # Every second view's lines are looked for at all depths: neighbours show the same ones.
 EVERY = 2
+# The lines are asked about in this many parts, which take unequally long.
+PARTS = 4 * THREADS
 
 
 @dataclass(frozen=True)
@@ -114,16 +117,23 @@ def _swept(stack: _Stack, radius: float) -> FloatArray:
     widest = int(2.0 * radius / NEAREST / stack.place[:, 4].min())
     chance = _chances(stack.edges, stack.size, widest)
     odds = np.stack([np.log(BOTH / chance), np.log((1.0 - BOTH) / (1.0 - chance))], axis=-1)
-    lines = []
-    for number in range(0, len(stack.place), EVERY):
+
+    def lines_of(number: int) -> FloatArray:
         rows, columns = stack.size[number]
         found = _lines(stack.edges[number, :rows, :columns], odds[number], int(2.0 * NARROWEST))
-        lines.append(np.column_stack([np.full(len(found), number), found]))
-    every = np.concatenate(lines)
-    arrays = stack.place, stack.size, stack.edges, stack.reach, odds, radius
-    axes = _distinct(_at_best_depth(every, *arrays), radius)
+        return np.column_stack([np.full(len(found), number), found])
+
+    def axes_of(lines: FloatArray) -> FloatArray:
+        arrays = stack.place, stack.size, stack.edges, stack.reach, odds, radius
+        found = mapped(lambda part: _at_best_depth(part, *arrays), np.array_split(lines, PARTS))
+        axes = np.concatenate(found)
+        axes[:, _LINE] = np.repeat(np.arange(len(lines)), IN_LINE)
+        return _distinct(axes, radius)
+
+    every = np.concatenate(mapped(lines_of, range(0, len(stack.place), EVERY)))
+    axes = axes_of(every)
     # The line of one view is a piece of the pipe: all of it tells the depth better.
-    return _distinct(_at_best_depth(_whole(every[axes[:, _LINE].astype(np.int64)], axes, stack.place), *arrays), radius)
+    return axes_of(_whole(every[axes[:, _LINE].astype(np.int64)], axes, stack.place))
 
 
 def _whole(lines: FloatArray, axes: FloatArray, place: FloatArray) -> FloatArray:
@@ -380,7 +390,7 @@ def _at_best_depth(
 ) -> FloatArray:
     """The axes (M, _COLUMNS) of lines (N, 6), which are a view's number and what `_lines` gives; 0 where there is none.
 
-    Each line has up to `IN_LINE` of them, end to end. For the other arguments see `_weigh`.
+    Each line has up to `IN_LINE` of them, end to end; their `_LINE` is left open. For the other arguments see `_weigh`.
     """
     result = np.zeros((len(lines) * IN_LINE, _COLUMNS))
     longest = int(2.0 * LONGEST / STRETCH)
@@ -418,5 +428,4 @@ def _at_best_depth(
             row[_X], row[_Y], row[_SIGMA], row[_VIEWS] = x, y, sigma, agreeing
             row[_LOW], row[_HIGH] = low + begin * STRETCH, low + end * STRETCH
             row[_CENTRE_X], row[_CENTRE_Y], row[_CENTRE_ALONG] = centre_x, centre_y, along
-            row[_LINE] = k
     return result

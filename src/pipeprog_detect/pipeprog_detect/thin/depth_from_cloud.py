@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.plane_segmentation import Plane
-from pipeprog_detect.silhouette.apparent_contour import in_image
+from pipeprog_detect.silhouette.apparent_contour import ViewArrays
 from pipeprog_detect.types import Cylinder, View
 
 # Width of the strip of cloud beside a thin pipe that it is compared with, in its own widths.
@@ -35,8 +35,11 @@ FOREMOST = 0.25
 
 def mean_centre(cylinder: Cylinder, views: Sequence[View]) -> FloatArray | None:
     """Mean projection centre (3,) of the views that show the cylinder's middle, None where none does."""
-    centres = [view.centre for view in views if in_image(view, cylinder.middle[None])[0]]
-    return np.asarray(np.mean(centres, axis=0), np.float64) if centres else None
+    if not views:
+        return None
+    arrays = ViewArrays.of(views)
+    centres = arrays.centres[arrays.showing(cylinder.middle[None])]
+    return np.asarray(centres.mean(axis=0), np.float64) if len(centres) else None
 
 
 def covers(one: Cylinder, other: Cylinder, centre: FloatArray, radii: float, common: float = -GAP) -> bool:

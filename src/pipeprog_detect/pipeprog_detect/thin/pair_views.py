@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,11 +12,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.config import THREADS
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, contour_samples
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
 from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line
 from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
+from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 
 # Baseline from view to view, as a share of the median depth of what they see, and number of views at the most.
@@ -68,10 +67,8 @@ def pair_views(
             shadows and seams look like thin pipes.
         edges: straight edges that earlier calls found, by stamp and width; new ones are added.
     """
-    # Most of the time is OpenCV's line segments, which leave the interpreter to the other threads.
-    with ThreadPoolExecutor(THREADS) as pool:
-        seen = pool.map(lambda view: _pair_view(view, points, radii, known, edges), _apart(views, points))
-        return [each for each in seen if each is not None]
+    seen = mapped(lambda view: _pair_view(view, points, radii, known, edges), _apart(views, points))
+    return [each for each in seen if each is not None]
 
 
 def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:

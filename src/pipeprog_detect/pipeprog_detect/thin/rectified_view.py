@@ -8,7 +8,6 @@ sight gets along the direction while it gets a metre away from that line.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -18,10 +17,10 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.cylinder_fit import basis
-from pipeprog_detect.config import THREADS
 from pipeprog_detect.silhouette.apparent_contour import contour_samples, parts_by_view
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
 from pipeprog_detect.silhouette.scene import SPACING
+from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 
 # What a cell of the image shows: no edge along its row, or one within a row of it; what lies outside the image or on
@@ -67,10 +66,8 @@ def rectified_views(views: Sequence[View], direction: FloatArray, known: Sequenc
     contours = _contours(views, direction, known)
     rows = cylinder_rows(known)
     sights = [_Sight.of(view, direction) for view in views]
-    # Most of it is compiled, and lets other threads run.
-    with ThreadPoolExecutor(THREADS) as pool:
-        found = pool.map(lambda sight, lines: _rectified(sight, lines, rows), sights, contours)
-        return [each for each in found if each is not None]
+    found = mapped(lambda sight: _rectified(sight[0], sight[1], rows), zip(sights, contours, strict=True))
+    return [each for each in found if each is not None]
 
 
 @dataclass(frozen=True)

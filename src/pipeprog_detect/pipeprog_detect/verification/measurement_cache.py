@@ -13,7 +13,7 @@ from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_detect.cloud.collinear import near
 from pipeprog_detect.cloud.map_change import MapChange
 from pipeprog_detect.refinement.contour_fit import ContourFit
-from pipeprog_detect.silhouette.apparent_contour import in_image
+from pipeprog_detect.silhouette.apparent_contour import ViewArrays
 from pipeprog_detect.types import Cylinder, View
 
 # A candidate is the same while its ends move by less than the cloud's own scatter [m] and a share of its radius, and
@@ -54,7 +54,7 @@ class Question:
         """The question of a fit among all `others` and `views`."""
         beside = [other for other in others if near(other, cylinder, _BESIDE)]
         around = cylinder.at(_AROUND)
-        seeing = [view for view in views if in_image(view, around).any()]
+        seeing = [views[number] for number in np.flatnonzero(ViewArrays.of(views).showing(around))] if views else []
         poses = {view.stamp: view.camera_from_map for view in seeing}
         rolled = {view.stamp: view.rolled for view in seeing if view.rolled is not None}
         return cls(cylinder, follow, beside, poses, rolled)

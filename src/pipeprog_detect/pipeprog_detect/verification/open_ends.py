@@ -16,6 +16,7 @@ from pipeprog_detect.refinement.extension import CERTAIN, LEAST, MAX_EXTENSIONS
 from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
 from pipeprog_detect.silhouette.free_space import MIN_VIEWS, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -48,7 +49,7 @@ def with_open_ends(
         rims = (0.0 if start else each.rims[0], 0.0 if end else each.rims[1])
         return replace(each, cylinder=longer, rims=rims)
 
-    return [one(number) for number in range(len(measured))]
+    return mapped(one, range(len(measured)))
 
 
 def _further(
