@@ -53,7 +53,7 @@ GLUE = {
     },
 }
 # Inside a package: which folder may import which; modules beside node.py may import all of them,
-# and all may import config.py and types.py.
+# and all may import config.py, threads.py and types.py.
 FOLDERS = {
     "pipeprog_node": {"processes": set(), "received": {"messages", "intake"}},
     "pipeprog_sfm": {
