@@ -18,6 +18,7 @@ from pipeprog_detect.silhouette.occlusion import (
     BEFORE,
     MARGIN,
     cylinder_rows,
+    depth_of_cylinders,
     hidden_by_cloud,
     hidden_by_cylinders,
 )
@@ -135,6 +136,29 @@ def test_cylinders_hide_what_lies_behind_them() -> None:
         expected |= (nearest > 0) & (nearest < depth) & (miss < reach) & (place > -reach) & (place < length + reach)
     np.testing.assert_array_equal(hidden_by_cylinders(seen, pixel, depth, rows), expected)
     assert 0.1 < expected.mean() < 0.9
+
+
+def test_lines_of_sight_meet_the_first_cylinder() -> None:
+    """By the quadratic equation of each cylinder, some of which reach behind the camera."""
+    seen = view()
+    ends = RANDOM.uniform([-1.5, -1.0, -0.5], [1.5, 1.0, 4.0], (25, 2, 3))
+    rows = cylinder_rows([Cylinder(start, end, 0.05) for start, end in ends])
+    pixel = RANDOM.uniform([0, 0], [320, 180], (400, 2))
+    rays = np.stack([(pixel[:, 0] - 159.5) / 300.0, (pixel[:, 1] - 89.5) / 300.0, np.ones(400)], axis=1)
+    rays = rays @ seen.camera_from_map[:3, :3]
+    expected = np.full(400, np.inf)
+    for start, axis, length, radius in ((row[:3], row[3:6], row[6], row[7]) for row in rows):
+        from_axis = seen.centre - start
+        from_axis = from_axis - (from_axis @ axis) * axis
+        flat = rays - np.outer(rays @ axis, axis)
+        square, half = (flat**2).sum(axis=1), flat @ from_axis
+        root = half**2 - square * (from_axis @ from_axis - radius**2)
+        depth = (-half - np.sqrt(np.maximum(root, 0.0))) / square
+        place = depth * (rays @ axis) + (seen.centre - start) @ axis
+        met = (root > 0.0) & (depth > 0.0) & (place > 0.0) & (place < length)
+        expected[met] = np.minimum(expected, depth)[met]
+    np.testing.assert_allclose(depth_of_cylinders(seen, pixel, rows), expected, rtol=1e-9)
+    assert 0.1 < np.isfinite(expected).mean() < 0.9
 
 
 def test_the_cloud_hides_what_lies_behind_it() -> None:
