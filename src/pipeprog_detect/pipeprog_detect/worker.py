@@ -143,17 +143,15 @@ def serve(
         if command.final:
             memory.novelty = MapChange()
         normals = None if command.normals is None else command.normals.astype(float)
+        cloud = Cloud(command.points.astype(float), normals)
+        boards = board_faces(command.circles.centres, command.circles.radii)
         try:
-            cloud, boards = (
-                Cloud(command.points.astype(float), normals),
-                board_faces(command.circles.centres, command.circles.radii),
-            )
             pipes = detect(cloud, boq, config, views, memory=memory, boards=boards)
         except InputError as error:
             connection.send(NoPipes(command.revision, str(error)))
             continue
         if any(asks_look(pipe, boq, config.concave) for pipe in pipes):
-            seen = Seen(views, keyframes.colour, command.points.astype(float), command.circles)
+            seen = Seen(views, keyframes.colour, cloud.points, command.circles)
             pipes = told_by_look(pipes, boq, seen, config.concave)
         # In the end the names are those of `detect`, by place: earlier ones depend on which maps came in between.
         if not command.final:

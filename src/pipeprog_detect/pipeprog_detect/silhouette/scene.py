@@ -33,7 +33,7 @@ from pipeprog_detect.types import Cylinder, View
 # Length of contour [px] that makes one measurement: the mean over it averages texture, the line stays straight within.
 SPACING = 12
 # Where a limited number of samples is wanted, this many times as many are tried: a pipe of which others hide three
-# quarters still gives all.
+# quarters still gives half of them or more.
 MOSTLY_HIDDEN = 4
 # The limb model's window outside the pipe, where the next thing may begin: this width [px], and three blurs.
 OUTWARD, OUTWARD_OF_BLUR = 1.5, 3.0
