@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -28,10 +29,12 @@ from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstructio
 from pipeprog_sfm.sparse.overlap import OverlapReport
 from pipeprog_sfm.warm_up import warm_up
 
-IDLE_SECONDS = 1.0  # without a command, after which a map is published early: the next keyframe may never come
-# Without a command, after which a map that is not of all there is waits for the next one: keyframes of a walking camera
-# come at 2 to 3 Hz, and where none comes any more the pipes of the last map would wait for those of this one.
+IDLE_SECONDS = 1.0  # since a keyframe came, after which a map is published early: the next one may never come
+# Since a keyframe came, after which no map is made or sent that is not of all there is: those of a walking camera come
+# at 2 to 3 Hz, and where none comes any more the last map, and its pipes, would wait for this one.
 HOLD_SECONDS = 0.5
+# Since a command was worked off, until which one that follows from it may come: some keyframes are retired then.
+ANSWER_SECONDS = 0.3
 POLL_SECONDS = 0.1  # between checks whether the requested map is finished
 
 
@@ -155,21 +158,22 @@ def work(
 ) -> None:
     """As `serve`; `clock` tells seconds.
 
-    A map is requested after `map_interval` keyframes, and one of all depth maps that can be made by then when no
-    command has come for IDLE_SECONDS; with None, no map but the last. A map that is finished in a silence of
-    HOLD_SECONDS is sent after the next command, and not at all where the one of all depth maps follows.
+    A map is requested after `map_interval` keyframes, and one of all depth maps that can be made by then when all
+    commands are worked off and no keyframe has come for IDLE_SECONDS; with None, no map but the last. Once none has
+    come for HOLD_SECONDS the others are not requested, and one that is finished then is sent when the next keyframe
+    comes, or not at all where the one of all depth maps follows.
     """
     for earlier in answered:
         _answer(reconstruction, earlier)
         reconstruction.update_dense()
     channel.send(Ready())
-    since_map, settled, idle_since = 0, True, clock()
+    since_map, settled, heard, done = 0, True, clock(), clock()
     held: MapReady | None = None
+    waiting: deque[Command] = deque()
     while True:
-        busy = map_interval is not None and (not settled or reconstruction.is_mapping)
-        came = channel.poll(POLL_SECONDS if busy else None)
-        if came:
-            command = channel.recv()
+        worked = bool(waiting)
+        if waiting:
+            command = waiting.popleft()
             if isinstance(command, Finish):
                 reconstruction.move(command.motion)
                 channel.send(_finish(channel, reconstruction, command))
@@ -179,7 +183,14 @@ def work(
             if isinstance(command, AddKeyframe):
                 reconstruction.update_dense()  # once the pose is out
                 since_map, settled = since_map + 1, False
-            idle_since = clock()
+            done = clock()
+        idle = map_interval is None or (settled and not reconstruction.is_mapping)
+        patience = 0.0 if worked or waiting else None if idle else POLL_SECONDS
+        while channel.poll(patience):
+            waiting.append(channel.recv())
+            patience = 0.0
+            if isinstance(waiting[-1], AddKeyframe):
+                heard = clock()
         if map_interval is None:
             continue
         try:
@@ -188,13 +199,14 @@ def work(
             finished, since_map = None, map_interval
         if finished is not None:
             held = MapReady(reconstruction.status(), finished)
-        silence = clock() - idle_since
+        silence = clock() - heard
         if held is not None and (settled or silence < HOLD_SECONDS):
             channel.send(held)
             held = None
-        idle = not settled and silence > IDLE_SECONDS
-        if not reconstruction.is_mapping and ((came and since_map >= map_interval) or idle):
-            settled, held = idle, None
+        at_rest = not (settled or waiting) and silence > IDLE_SECONDS and clock() - done > ANSWER_SECONDS
+        due = worked and since_map >= map_interval and silence < HOLD_SECONDS
+        if not reconstruction.is_mapping and (due or at_rest):
+            settled, held = at_rest, None
             with contextlib.suppress(NotMetricError):  # the status says why, the next keyframe may measure the scale
                 reconstruction.request_map(settled)
                 since_map = 0

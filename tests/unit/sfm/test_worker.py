@@ -10,7 +10,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm import worker
 from pipeprog_sfm.reconstruction import NotMetricError
-from pipeprog_sfm.worker import HOLD_SECONDS, IDLE_SECONDS, POLL_SECONDS
+from pipeprog_sfm.worker import ANSWER_SECONDS, HOLD_SECONDS, IDLE_SECONDS, POLL_SECONDS
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 KEYFRAME = worker.AddKeyframe(1, b"", CAMERA)
@@ -66,10 +66,14 @@ class Prompt:
 
 
 class Script:
-    """A connection that delivers commands; a float in their place is a silence of that length in seconds."""
+    """A connection that delivers commands; a float in their place is a silence of that length in seconds.
 
-    def __init__(self, *steps: worker.Command | float) -> None:
+    It closes when the loop waits for more. `cost` [s]: what the loop spends on each command.
+    """
+
+    def __init__(self, *steps: worker.Command | float, cost: float = 0.0) -> None:
         self._steps = list(steps)
+        self._cost = cost
         self.now = 0.0
         self.events: list[Any] = []
 
@@ -85,7 +89,7 @@ class Script:
                 left -= waited
                 if left <= 0:
                     return False
-        return True
+        return bool(self._steps) or timeout != 0.0
 
     def recv(self) -> Any:
         if not self._steps:
@@ -94,6 +98,16 @@ class Script:
 
     def send(self, event: object) -> None:
         self.events.append(event)
+        if isinstance(event, worker.KeyframeDone):
+            self._spend(self._cost)
+
+    def _spend(self, seconds: float) -> None:
+        """Lets time pass, in which silences do, too."""
+        self.now += seconds
+        for place, step in enumerate(self._steps):
+            if isinstance(step, float):
+                self._steps[place] = max(step - seconds, 0.0)
+                seconds = max(seconds - step, 0.0)
 
 
 def events(
@@ -102,9 +116,10 @@ def events(
     map_interval: int | None = MAP_INTERVAL,
     metric_after: int = 0,
     looks: int = 1,
+    cost: float = 0.0,
 ) -> list[Any]:
     """What the loop sends until the connection closes."""
-    script = Script(*steps)
+    script = Script(*steps, cost=cost)
     with pytest.raises(EOFError):
         worker.work(script, cast(Any, Prompt(metric_after, looks)), map_interval, answered, lambda: script.now)
     return script.events
@@ -151,13 +166,33 @@ def test_a_map_that_is_finished_in_a_silence_waits_for_the_next_keyframe() -> No
     assert HOLD_SECONDS < 0.6 * IDLE_SECONDS
     walk = [KEYFRAME] * MAP_INTERVAL
     sent = events(*walk, 0.9 * IDLE_SECONDS, KEYFRAME, 0.1 * IDLE_SECONDS, looks=looks)
-    assert [type(event) for event in sent[1 + MAP_INTERVAL :]] == [worker.KeyframeDone, worker.MapReady]
-    assert sent[-1].map == "early map"
+    assert [type(event) for event in sent[1 + MAP_INTERVAL :]] == [worker.MapReady, worker.KeyframeDone]
+    assert sent[-2].map == "early map"
     sent = events(*walk, 10 * IDLE_SECONDS, looks=looks)
     assert [event.map for event in sent[1 + MAP_INTERVAL :]] == ["settled map"]
     sent = events(*walk, 0.9 * IDLE_SECONDS, worker.Finish(), 10 * IDLE_SECONDS, looks=looks)
     assert [type(event) for event in sent[1 + MAP_INTERVAL :]] == [worker.MapReady, worker.Finished]
     assert sent[-2].map == "last map"
+
+
+def test_once_the_camera_rests_the_only_map_is_that_of_all_keyframes() -> None:
+    waiting = [KEYFRAME] * (3 * MAP_INTERVAL)
+    sent = events(*waiting, 10 * IDLE_SECONDS, cost=HOLD_SECONDS)
+    assert [type(event) for event in sent] == [worker.Ready, *[worker.KeyframeDone] * len(waiting), worker.MapReady]
+    assert sent[-1].map == "settled map"
+
+
+def test_while_the_camera_walks_maps_come_although_keyframes_wait() -> None:
+    walk: list[worker.Command | float] = [KEYFRAME, KEYFRAME, 0.5 * HOLD_SECONDS] * (2 * MAP_INTERVAL)
+    sent = events(*walk, cost=HOLD_SECONDS)
+    assert [event.map for event in sent if isinstance(event, worker.MapReady)][:1] == ["early map"]
+
+
+def test_the_map_of_all_waits_for_what_follows_from_the_last_keyframe() -> None:
+    cost = 2 * IDLE_SECONDS
+    sent = events(KEYFRAME, cost + 0.5 * ANSWER_SECONDS, worker.Retire((1,)), 10 * IDLE_SECONDS, cost=cost)
+    kinds = [worker.Ready, worker.KeyframeDone, worker.Retired, worker.MapReady]
+    assert [type(event) for event in sent] == kinds
 
 
 def test_a_camera_at_rest_without_a_scale_is_not_asked_again() -> None:
