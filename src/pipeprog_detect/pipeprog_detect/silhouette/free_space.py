@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the keyframes see through a cylinder: what they show behind its axis proves that no pipe is there."""
+"""Where the keyframes see through a cylinder: what they show behind it proves that no pipe is there."""
 
 from __future__ import annotations
 
@@ -22,6 +22,10 @@ STEP = 0.01
 MIN_VIEWS, MIN_SHARE = 3, 0.5
 # What is seen lies behind where it is farther from the axis than the inside of an open end, one radius, and a fifth.
 BEHIND_RADII = 1.2
+# Beside the axis they are looked at here, in radii: as far from it as a cell of a view's depths allows, which must lie
+# within the limb. The barrel is three quarters of the radius before its axis there; what lies behind the axis by half
+# of the radius is none of it.
+BESIDE, BEHIND_LIMB = 0.65, 0.5
 # A stretch whose contour is seen is no gap. It is looked at this often [px].
 SPACING = 6
 # A known part without holes tells that a stretch is none where it is this many times as long: after k times its length
@@ -53,6 +57,31 @@ def free_stretches(
         for first, last in stretches
         if excused < last - first < longest or not _shows_a_contour(cylinder.cut(first, last), views, others)
     ]
+
+
+def is_empty_beside(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
+    """Whether the views see through a cylinder between its axis and one limb, and not at the other.
+
+    Then one of its limbs is the edge of another thing: of a shadow on the wall behind a thinner pipe, or of a tray.
+    For the arguments see `free_stretches`.
+    """
+    count = max(int(np.ceil(cylinder.length / STEP)), 2)
+    axis = cylinder.at((np.arange(count) + 0.5) / count)
+    rows, room = cylinder_rows(others), 2.0 * (1.0 - BESIDE) * cylinder.radius
+    reach = max(BEFORE, BEHIND_LIMB * cylinder.radius)
+    through, on_it, seeing = np.zeros(2), np.zeros(2), np.zeros(2)
+    for index in np.flatnonzero(ViewArrays.of(views).showing(axis)) if views else ():
+        view = views[index]
+        across = np.cross(cylinder.axis, axis - view.centre)
+        across *= BESIDE * cylinder.radius / np.linalg.norm(across, axis=1)[:, None]
+        for side, points in enumerate((axis - across, axis + across)):
+            _, depth, nearest = _seen_at(points, room, view, rows)
+            behind = nearest > depth + reach
+            through[side] += behind.sum()
+            on_it[side] += (~behind & (nearest > depth - cylinder.radius - BEFORE)).sum()
+            seeing[side] += behind.any()
+    empty = (through > MIN_SHARE * (through + on_it)) & (seeing >= MIN_VIEWS)
+    return bool(empty.any() and not empty.all())
 
 
 def _holes(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> float:
@@ -93,17 +122,29 @@ def _looked_through(
     stereo shows the wall behind them.
     """
     through, opaque = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    looked, depth, nearest = _seen_at(points, radius, view, others)
+    behind = depth + max(BEFORE, BEHIND_RADII * radius)
+    through[looked] = nearest > behind
+    opaque[looked] = nearest <= behind
+    return through, opaque
+
+
+def _seen_at(
+    points: FloatArray, room: float, view: View, others: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.float32]]:
+    """Of the points (N, 3) those where a view has a depth: row (M,), their depth and that of what is seen (M,) [m].
+
+    The cell of its depths must be smaller than `room` [m] there, and none of the `others` hide the point.
+    """
     if view.nearest is None:
-        return through, opaque
+        return np.empty(0, np.int64), np.empty(0), np.empty(0, np.float32)
     cell = view.camera.width / view.nearest.shape[1]
     looked = np.flatnonzero(in_image(view, points))
     pixel, depth = project(view, points[looked])
-    told = (view.camera.fx * radius > cell * depth) & ~hidden_by_cylinders(view, pixel, depth, others)
+    told = (view.camera.fx * room > cell * depth) & ~hidden_by_cylinders(view, pixel, depth, others)
     looked, pixel, depth = looked[told], pixel[told], depth[told]
     row = np.clip((pixel[:, 1] / cell).astype(np.int64), 0, view.nearest.shape[0] - 1)
     column = np.clip((pixel[:, 0] / cell).astype(np.int64), 0, view.nearest.shape[1] - 1)
     nearest = view.nearest[row, column]
-    behind = depth + max(BEFORE, BEHIND_RADII * radius)
-    through[looked] = np.isfinite(nearest) & (nearest > behind)
-    opaque[looked] = nearest <= behind
-    return through, opaque
+    known = np.isfinite(nearest)
+    return looked[known], depth[known], nearest[known]

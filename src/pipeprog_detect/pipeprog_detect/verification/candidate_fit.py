@@ -14,6 +14,7 @@ from pipeprog_detect.product.classification import is_planned
 from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.refinement.one_sided import SeenArc, with_radius
+from pipeprog_detect.silhouette.free_space import is_empty_beside
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache, Question
@@ -112,12 +113,17 @@ class CandidateFitter:
         return fit
 
     def of_planned_radius(
-        self, candidate: Candidate, others: Sequence[Cylinder], views: Sequence[View]
+        self,
+        candidate: Candidate,
+        others: Sequence[Cylinder],
+        views: Sequence[View],
+        least_support: float = CONVINCING,
     ) -> ContourFit | None:
         """The most probable fit of a planned radius that the cloud of a candidate allows; None without one.
 
         Lines beside a thin pipe, such as its shadow's, are taken for its contour where its radius is left open. A fit
-        that they have led three standard deviations away from the planned radius is one of theirs.
+        that they have led three standard deviations away from the planned radius is one of theirs, and so is one that
+        the views see through beside a limb.
         """
         noise, cylinder = candidate.evidence.noise, candidate.cylinder
         near = self._within_reach(candidate)
@@ -125,7 +131,11 @@ class CandidateFitter:
         good = [
             fit
             for planned, fit in fits
-            if fit is not None and fit.support > CONVINCING and self.is_planned(fit) and _has_size(fit, planned)
+            if fit is not None
+            and fit.support > least_support
+            and self.is_planned(fit)
+            and _has_size(fit, planned)
+            and not is_empty_beside(fit.cylinder, views, others)
         ]
         return max(good, key=lambda fit: fit.log_odds, default=None)
 

@@ -15,7 +15,7 @@ from pipeprog_detect.refinement.extension import LEAST_STUB
 from pipeprog_detect.refinement.one_sided import only_visible_side
 from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
-from pipeprog_detect.silhouette.free_space import free_stretches
+from pipeprog_detect.silhouette.free_space import free_stretches, is_empty_beside
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter
@@ -184,6 +184,8 @@ class KeyframeVerifier:
             fit = self._fitter.near_planned(candidate, fit, others, self._views)
         if fit is None:
             return MeasuredPipe.of_cloud(candidate)
+        if is_empty_beside(fit.cylinder, self._views, others):
+            fit = self._fitter.of_planned_radius(candidate, others, self._views, MIN_SUPPORT) or fit
         is_weak = trusted and fit.support < CONVINCING and self._fitter.is_planned_in_cloud(candidate)
         if not self._fitter.is_planned(fit) and (is_weak or contradict(candidate, fit)):
             return MeasuredPipe.between_ends_of(candidate, fit)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import project
-from pipeprog_detect.silhouette.free_space import SPACING, free_stretches
+from pipeprog_detect.silhouette.free_space import SPACING, free_stretches, is_empty_beside
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
@@ -68,6 +68,33 @@ def test_a_hidden_gap_is_not_told() -> None:
 
 def test_a_pipe_thinner_than_the_cells_is_not_judged() -> None:
     assert free_stretches(line(0.008), seen(), []) == []
+
+
+@given(radius=st.floats(0.03, 0.09), times=st.floats(1.5, 1.8), side=st.sampled_from([-1.0, 1.0]))
+@settings(max_examples=15, deadline=None)
+def test_a_limb_that_is_a_shadows_edge_has_nothing_before_it(radius: float, times: float, side: float) -> None:
+    """One limb is the pipe's, the other lies beyond it: the axis is aside by what the radius is too large."""
+    views = seen(tube(-HALF, HALF, radius))
+    aside = np.array([0.0, 0.0, side * (times - 1.0) * radius])
+    wider = Cylinder(line(radius).start + aside, line(radius).end + aside, times * radius)
+    assert is_empty_beside(wider, views, [])
+    assert not is_empty_beside(wider, views[:2], [])
+    assert not is_empty_beside(line(radius), views, [])
+
+
+def test_a_limb_that_others_hide_is_not_told_to_be_empty() -> None:
+    views = seen(tube(-HALF, HALF, 0.04))
+    aside = np.array([0.0, 0.0, 0.03])
+    wider = Cylinder(line(0.04).start + aside, line(0.04).end + aside, 0.07)
+    before = Cylinder(np.array([-HALF, -0.3, 0.07]), np.array([HALF, -0.3, 0.07]), 0.05)
+    assert is_empty_beside(wider, views, [])
+    assert not is_empty_beside(wider, views, [before])
+    board = tube(-HALF, HALF, 0.05) + np.array([0.0, -0.3, 0.07])
+    assert not is_empty_beside(wider, seen(tube(-HALF, HALF, 0.04), board), [])
+
+
+def test_where_no_pipe_is_neither_limb_is_told_from_the_other() -> None:
+    assert not is_empty_beside(line(0.05), seen(), [])
 
 
 def test_two_views_are_too_few() -> None:
