@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_sfm.model.tracks import NONE, digests, extend, filter_tracks, triangulate
+from pipeprog_sfm.model.tracks import NONE, covisible, digests, extend, filter_tracks, triangulate
 
 MAX_ERROR = 3.0  # px: the noise of SIFT is below 1 px, wrong matches are uniform in the search range
 INITIAL_NOISE = 1.0  # px, of a coordinate, before it can be estimated: more than SIFT has
@@ -178,12 +178,8 @@ class SparseModel:
         return digests(self.point_of, np.array(self.offsets))
 
     def covisible(self, view: int) -> IntArray:
-        """(V,) number of points that each view shares with this one."""
-        flags = np.zeros(len(self.points) + 1, bool)
-        flags[self.seen(view)] = True
-        shared = np.bincount(self.view_of[flags[self.point_of]], minlength=len(self))
-        shared[view] = 0
-        return shared
+        """(V,) number of points that each view shares with this one; 0 for itself."""
+        return covisible(view, self.point_of, np.array(self.offsets), len(self.points))
 
     def forget_unseen(self) -> None:
         """Removes the points that no view sees, and numbers the others anew."""

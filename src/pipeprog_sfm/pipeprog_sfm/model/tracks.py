@@ -34,6 +34,22 @@ def digests(point_of, offsets):  # type: ignore[no-untyped-def]  # compiled
 
 
 @njit(cache=True, nogil=True)
+def covisible(view, point_of, offsets, points):  # type: ignore[no-untyped-def]  # compiled
+    """(V,) number of features of each view whose points, of which there are `points`, this one sees, too."""
+    seen = np.zeros(points, np.bool_)
+    for feature in range(offsets[view], offsets[view + 1]):
+        if point_of[feature] != NONE:
+            seen[point_of[feature]] = True
+    shared = np.zeros(len(offsets) - 1, np.int64)
+    for other in range(len(shared)):
+        if other != view:
+            for feature in range(offsets[other], offsets[other + 1]):
+                if point_of[feature] != NONE and seen[point_of[feature]]:
+                    shared[other] += 1
+    return shared
+
+
+@njit(cache=True, nogil=True)
 def _root(alias, point):  # type: ignore[no-untyped-def]  # compiled
     while alias[point] != point:
         point = alias[point]

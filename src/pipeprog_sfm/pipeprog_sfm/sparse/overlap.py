@@ -51,7 +51,6 @@ class OverlapTracker:
     def changed(self, keyframes: Mapping[int, Keyframe], model: SparseModel, places: bool) -> list[OverlapReport]:
         """Overlap of the keyframes, by stamp, for which it changed since the last call; `places`: that with places."""
         view_of = {stamp: view for view, stamp in enumerate(model.stamps)}
-        tied = {stamp: model.features(view) for stamp, view in view_of.items()}
         digests = model.digests().tolist()
         marks = {stamp: digests[view_of[stamp]] if stamp in view_of else 0 for stamp in keyframes}
         changed = []
@@ -59,24 +58,30 @@ class OverlapTracker:
             mark = (marks.get(before), marks[stamp], marks.get(after))
             if self._reported.get(stamp) != mark:
                 self._reported[stamp] = mark
-                near = (model.point_of[tied[one]] if one in tied else None for one in (before, stamp, after))
-                report = _report(keyframes[stamp], *near)
-                if places and stamp in view_of:
-                    report = replace(report, place_overlap=place_overlap(model, view_of[stamp], keyframes))
+                view = view_of.get(stamp)
+                if view is None:
+                    changed.append(_report(keyframes[stamp], None, 0, 0))
+                    continue
+                shared = model.covisible(view)
+                previous, following = (int(shared[view_of[one]]) if one in view_of else 0 for one in (before, after))
+                report = _report(keyframes[stamp], model.point_of[model.features(view)], previous, following)
+                if places:
+                    report = replace(report, place_overlap=place_overlap(model, view, shared, keyframes))
                 changed.append(report)
         return changed
 
 
-def place_overlap(model: SparseModel, view: int, keyframes: Mapping[int, Keyframe]) -> float:
+def place_overlap(model: SparseModel, view: int, shared: IntArray, keyframes: Mapping[int, Keyframe]) -> float:
     """The share of what a view shows that each of SEEN_BEFORE views of earlier visits shows from the same side.
 
-    These are more than LOCAL_WINDOW views of each camera before it, and tied to it by points in common.
+    These are more than LOCAL_WINDOW views of each camera before it, and tied to it by points in common: `shared` (V,)
+    tells how many each view has.
     keyframes: at least those of the model's views, by stamp.
     """
     rank = np.argsort(np.argsort(model.stamps))
     cameras = len({keyframes[stamp].frame for stamp in model.stamps})
     earlier = np.flatnonzero(rank < rank[view] - LOCAL_WINDOW * cameras)
-    earlier = earlier[model.covisible(view)[earlier] >= MIN_INLIERS]
+    earlier = earlier[shared[earlier] >= MIN_INLIERS]
     others = [(model.pose(other), keyframes[model.stamps[other]].camera) for other in earlier]
     if len(others) < SEEN_BEFORE:
         return 0.0
@@ -93,8 +98,11 @@ def _in_time(keyframes: Mapping[int, Keyframe]) -> list[tuple[int, int, int]]:
     return sorted(found, key=lambda around: around[1])
 
 
-def _report(keyframe: Keyframe, before: IntArray | None, own: IntArray | None, after: IntArray | None) -> OverlapReport:
-    """Overlap of a keyframe by the points of its features and of its neighbours'; None: not registered."""
+def _report(keyframe: Keyframe, own: IntArray | None, previous: int, following: int) -> OverlapReport:
+    """Overlap of a keyframe by the points of its features, of which it shares some with its neighbours.
+
+    own: None: not registered.
+    """
     keypoints = keyframe.measured  # the hull of all features is that of the image as it is
     inside = keypoints[:0] if own is None else keypoints[own >= 0]
     size = keyframe.camera.width, keyframe.camera.height
@@ -105,13 +113,6 @@ def _report(keyframe: Keyframe, before: IntArray | None, own: IntArray | None, a
         grid_cells(inside, size) / max(keyframe.cells, 1),
         len(inside),
         len(keypoints),
-        _common(before, own),
-        _common(own, after),
+        previous,
+        following,
     )
-
-
-def _common(points: IntArray | None, others: IntArray | None) -> int:
-    """Points that two views both see."""
-    if points is None or others is None:
-        return 0
-    return len(np.intersect1d(points[points >= 0], others[others >= 0]))

@@ -92,26 +92,40 @@ def visits(*places: float) -> tuple[SparseModel, dict[int, Keyframe]]:
     return model, keyframes
 
 
+def seen_before(model: SparseModel, view: int, keyframes: dict[int, Keyframe]) -> float:
+    return place_overlap(model, view, model.covisible(view), keyframes)
+
+
 def test_a_place_was_seen_by_keyframes_of_an_earlier_visit_and_not_by_later_ones() -> None:
     model, keyframes = visits(*range(5), *range(14), 3.2)
     others = [0.2, 0.2, 0.8]  # of 3 and 4, which both visits have
     shown = [1 - shift * BASE / (2 * 1280 / 900) for shift in others]
-    assert place_overlap(model, 19, keyframes) == pytest.approx(min(shown), abs=0.02)
-    assert [place_overlap(model, each, keyframes) for each in range(5)] == [0.0] * 5
+    assert seen_before(model, 19, keyframes) == pytest.approx(min(shown), abs=0.02)
+    assert [seen_before(model, each, keyframes) for each in range(5)] == [0.0] * 5
+
+
+def test_views_share_the_points_that_both_see() -> None:
+    model, _ = visits(0, 1, 3, 1)
+    model.point_of[model.features(3)] = -1
+    for number in range(4):
+        own = set(model.seen(number).tolist())
+        expected = [0 if other == number else len(own & set(model.seen(other).tolist())) for other in range(4)]
+        assert model.covisible(number).tolist() == expected
+    assert 0 < model.covisible(0)[2] < model.covisible(0)[1]
 
 
 def test_neighbours_in_time_and_views_that_nothing_ties_are_no_earlier_visit() -> None:
     model, keyframes = visits(*range(5), 3.2)
-    assert place_overlap(model, 5, keyframes) == 0.0
+    assert seen_before(model, 5, keyframes) == 0.0
     model, keyframes = visits(*range(5), *range(14), 3.2)
     last = model.features(19)
     model.points = np.concatenate([model.points, model.points])  # the same points, not yet known to be the same
     model.point_of[last] += np.where(model.point_of[last] >= 0, 4000, 0)
-    assert place_overlap(model, 19, keyframes) == 0.0
+    assert seen_before(model, 19, keyframes) == 0.0
 
 
 def test_a_rig_has_as_many_more_neighbours_in_time_as_it_has_cameras() -> None:
     model, keyframes = visits(*range(5), *range(14), 3.2)
     sides = {stamp: replace(each, frame="left" if stamp // STEP % 2 else "right") for stamp, each in keyframes.items()}
-    assert place_overlap(model, 19, keyframes) > 0.9
-    assert place_overlap(model, 19, sides) == 0.0
+    assert seen_before(model, 19, keyframes) > 0.9
+    assert seen_before(model, 19, sides) == 0.0
