@@ -186,6 +186,9 @@ class KeyframeVerifier:
             return MeasuredPipe.of_cloud(candidate)
         if is_empty_beside(fit.cylinder, self._views, others):
             fit = self._fitter.of_planned_radius(candidate, others, self._views, MIN_SUPPORT) or fit
+        elif fit.support < CONVINCING:  # the cloud may lie beside the pipe by more than a contour is sought from there
+            other = self._fitter.of_planned_radius(candidate, others, self._views)
+            fit = other if other is not None and other.log_odds > fit.log_odds else fit
         is_weak = trusted and fit.support < CONVINCING and self._fitter.is_planned_in_cloud(candidate)
         if not self._fitter.is_planned(fit) and (is_weak or contradict(candidate, fit)):
             return MeasuredPipe.between_ends_of(candidate, fit)

@@ -13,6 +13,7 @@ from pipeprog_detect.config import ContourConfig, DetectConfig
 from pipeprog_detect.detector import detect
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CandidateFitter
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
@@ -84,6 +85,7 @@ def test_a_contour_that_is_hardly_seen_does_not_overrule_the_planned_radius_of_t
     contour = ContourFit(thin, np.eye(3)[1:], np.eye(5), 2e-4, support, 75.0, 20, (0.0, 0.0), 0.0, 0.5)
     monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: contour)
     monkeypatch.setattr(CandidateFitter, "near_planned", lambda *_: contour)
+    monkeypatch.setattr(CandidateFitter, "of_planned_radius", lambda *_: None)  # nor is another one seen
     cloud = Candidate(
         replace(PIPE, radius=0.99 * PIPE.radius), 3e-4, 900, CloudEvidence(np.pi, 0.9, 0.0, 1e-3, 0.0, 300.0)
     )
@@ -100,6 +102,44 @@ def test_the_keyframes_measure_a_pipe_unless_contours_are_disabled(pipe_views: l
     assert len(cloud_alone) == len(without) == len(measured) == 1
     assert without[0].cylinder.radius == cloud_alone[0].cylinder.radius
     assert measured[0].cylinder.radius != cloud_alone[0].cylinder.radius
+
+
+def beside(offset: float, radius: float) -> Cylinder:
+    """A cylinder whose axis lies `offset` [m] beside that of the pipe, as the cameras see it."""
+    across = np.cross(PIPE.axis, [0.0, 1.0, 0.0])
+    return Cylinder(PIPE.start + offset * across, PIPE.end + offset * across, radius)
+
+
+def measured_radius(candidate: Cylinder, noise: float, other: float, views: list[View]) -> float:
+    """Radius [m] of what the views make of a rough candidate where that of the pipe and another one are planned."""
+    boq = BillOfQuantities((*BOQ.classes, PipeClass("other", other, 3.0, (1.0, 0.0, 0.0), 4e-4)))
+    rough = Candidate(candidate, 1e-3, 900, CloudEvidence(np.pi, 0.9, 0.0, noise, 0.0, 300.0))
+    found = KeyframeVerifier(views, boq).measure([rough], [False])
+    return found[0].cylinder.radius
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_an_edge_before_which_nothing_is_seen_is_no_limb(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, side: float
+) -> None:
+    """A shadow on the wall had become a limb: a DN65 of two fields was a DN100."""
+    cloud = np.concatenate([wall_points(), front_points(PIPE)])
+    views = with_depths(pipe_views, cloud)
+    wide = ContourFit(beside(side * 0.024, 0.064), np.eye(3)[1:], np.eye(5), 2e-4, 0.8, 75.0, 20, (0.0, 0.0), 0.0, 0.5)
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: wide)
+    assert measured_radius(beside(side * 0.01, 0.05), 0.005, 0.064, views) == pytest.approx(PIPE.radius, abs=5e-4)
+    assert measured_radius(beside(side * 0.01, 0.05), 0.005, 0.064, pipe_views) == 0.064  # without what the cloud shows
+
+
+@pytest.mark.parametrize(("support", "log_odds", "right"), [(0.3, 10.0, True), (0.3, 1e6, False), (0.6, 10.0, False)])
+def test_a_contour_that_is_hardly_seen_gives_way_to_a_planned_one_that_is(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, support: float, log_odds: float, right: bool
+) -> None:
+    """The cloud of a DN225 lay 17 mm beside it, farther than a contour is sought: an edge on it made it a DN200."""
+    edge = ContourFit(beside(0.01, 0.046), np.eye(3)[1:], np.eye(5), 2e-4, support, log_odds, 20, (0.0, 0.0), 0.0, 0.5)
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: edge)
+    expected = PIPE.radius if right else 0.046
+    assert measured_radius(beside(0.012, PIPE.radius), 0.003, 0.046, pipe_views) == pytest.approx(expected, abs=5e-4)
 
 
 @pytest.mark.parametrize(("least", "stands"), [(0.3, True), (0.5, False)])
