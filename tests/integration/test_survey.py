@@ -241,9 +241,14 @@ def sendable_goals(count: int, seed: int) -> Iterator[dict[str, Any]]:
 
 
 def unlike_the_policy(mission: Mission, names: GraphNames) -> tuple[set[Access], set[Access]]:
-    """What the nodes use and the policy does not allow, and what it allows that they do not use."""
+    """What the nodes use and the policy does not allow, and what it allows that they do not use.
+
+    Discovery takes its time: it is told once all nodes are known.
+    """
     may = allowed(policy_xml(names))
-    do = used(mission.node, {enclave for enclave, *_ in may})
+    enclaves = {enclave for enclave, *_ in may}
+    mission.wait_for(lambda: {enclave for enclave, *_ in used(mission.node, enclaves)} == enclaves)
+    do = used(mission.node, enclaves)
     return do - may, may - do
 
 

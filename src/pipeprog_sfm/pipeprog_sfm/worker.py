@@ -186,11 +186,9 @@ def work(
             done = clock()
         idle = map_interval is None or (settled and not reconstruction.is_mapping)
         patience = 0.0 if worked or waiting else None if idle else POLL_SECONDS
-        while channel.poll(patience):
-            waiting.append(channel.recv())
-            patience = 0.0
-            if isinstance(waiting[-1], AddKeyframe):
-                heard = clock()
+        came = _take(channel, waiting, patience)
+        if any(isinstance(command, AddKeyframe) for command in came):
+            heard = clock()
         if map_interval is None:
             continue
         try:
@@ -210,6 +208,20 @@ def work(
             with contextlib.suppress(NotMetricError):  # the status says why, the next keyframe may measure the scale
                 reconstruction.request_map(settled)
                 since_map = 0
+
+
+def _take(channel: Channel, waiting: deque[Command], patience: float | None) -> list[Command]:
+    """The commands that have come, after a wait for the first one, which now wait; EOFError once there are no more."""
+    came: list[Command] = []
+    while channel.poll(0.0 if came else patience):
+        try:
+            came.append(channel.recv())
+        except EOFError:
+            if not (waiting or came):
+                raise
+            break  # what has come before the other end closed is worked off
+    waiting.extend(came)
+    return came
 
 
 def _answer(reconstruction: Reconstruction, command: AddKeyframe | Retire) -> KeyframeDone | Retired:

@@ -68,7 +68,7 @@ class Prompt:
 class Script:
     """A connection that delivers commands; a float in their place is a silence of that length in seconds.
 
-    It closes when the loop waits for more. `cost` [s]: what the loop spends on each command.
+    It closes when the loop waits for more. `cost` [s]: what the loop spends on each keyframe.
     """
 
     def __init__(self, *steps: worker.Command | float, cost: float = 0.0) -> None:
