@@ -28,6 +28,22 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest tests neither first nor last: after those of what they run, which compile it, and before short ones.
+
+    Two processes would compile the same code at first, and one would wait for the other's long test in the end.
+    """
+    tests = Path(__file__).parent
+    compiling, long = (tests / "unit" / "detect", tests / "unit" / "sfm"), tests / "integration"
+
+    def rank(item: pytest.Item) -> int:
+        if any(item.path.is_relative_to(folder) for folder in compiling):
+            return 0
+        return 1 if item.path.is_relative_to(long) else 2
+
+    items.sort(key=rank)
+
+
 def pytest_unconfigure(config: pytest.Config) -> None:
     """Gives the ports back."""
     _KEPT.close()
