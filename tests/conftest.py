@@ -34,12 +34,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Two processes would compile the same code at first, and one would wait for the other's long test in the end.
     """
     tests = Path(__file__).parent
-    compiling, long = (tests / "unit" / "detect", tests / "unit" / "sfm"), tests / "integration"
+    ranks = ("unit/detect", "unit/sfm"), ("integration", "unit/examples")
 
     def rank(item: pytest.Item) -> int:
-        if any(item.path.is_relative_to(folder) for folder in compiling):
-            return 0
-        return 1 if item.path.is_relative_to(long) else 2
+        folders = ([tests / folder for folder in each] for each in ranks)
+        found = (k for k, each in enumerate(folders) if any(item.path.is_relative_to(folder) for folder in each))
+        return next(found, len(ranks))
 
     items.sort(key=rank)
 
