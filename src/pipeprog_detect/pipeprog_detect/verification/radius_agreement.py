@@ -29,8 +29,11 @@ def is_resolved(candidate: Candidate) -> bool:
 
 
 def agree(candidate: Candidate, fit: ContourFit) -> bool:
-    """Whether a cloud that resolves the section has the radius of the contour."""
-    sigma = np.hypot(candidate.radius_sigma, fit.radius_sigma)
+    """Whether a cloud that resolves the section has the radius of the contour.
+
+    What stereo errs by is alike all along a pipe: the radius may be off by as much as the points scatter.
+    """
+    sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, fit.radius_sigma])
     difference = abs(fit.cylinder.radius - candidate.cylinder.radius)
     return is_resolved(candidate) and bool(difference < AGREEMENT * sigma)
 
