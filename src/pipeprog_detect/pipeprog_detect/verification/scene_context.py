@@ -35,6 +35,9 @@ _ASLANT, _LEAST_POINTS = 3.0, 3
 _TOLD = 0.25
 # A cylinder whose axis lies behind the wall, or before it by less than this share of the radius, is in it.
 _IN_WALL = 0.5
+# Where two planes meet in a cylinder they are looked for this far beside it [m]: stereo leaves out the foot of a wall,
+# in the shade and at the border of the images.
+_FOOT = 0.2
 # Share of a cylinder within or before which a wall may be seen: it may have been continued into one. Walls farther than
 # this many radii from the axis are before the cylinder for some views and beside it for others.
 _COVERED, _CLOSE = 0.25, 2.0
@@ -155,16 +158,20 @@ class SceneContext:
         """Whether a wall is as near to the axis as the radius, along more than half of the cylinder.
 
         Lines on a wall, such as shadows, joints and its corner with the next one, look like a thin pipe on it. In a
-        corner stereo shows neither wall: a wall that ends beside the cylinder goes on to it.
+        corner stereo shows neither wall: a wall that ends beside the cylinder goes on to it, also from farther away
+        where another one crosses it there.
         """
         nearest = cylinder.radius + self.clearance
-        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, nearest + _LEAST_BESIDE)]
+        along = [plane for plane in self.planes if abs(plane.normal @ cylinder.axis) < ALONG]
+        through = [each.normal for each in along if abs(each.normal @ cylinder.middle - each.offset) < nearest]
+        is_corner = any(abs(one @ other) < CORNER for one, other in combinations(through, 2))
+        reach = nearest + (_FOOT if is_corner else _LEAST_BESIDE)
+        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, reach)]
         foot = cylinder.at(cylinder.along(points) / cylinder.length)
         touching = np.linalg.norm(points - foot, axis=1) < nearest
-        for plane in self.planes:
-            if abs(plane.normal @ cylinder.axis) < ALONG:
-                from_points, from_axis = (np.abs(each @ plane.normal - plane.offset) for each in (points, foot))
-                touching |= (from_points < self.clearance) & (from_axis < nearest)
+        for plane in along:
+            from_points, from_axis = (np.abs(each @ plane.normal - plane.offset) for each in (points, foot))
+            touching |= (from_points < self.clearance) & (from_axis < nearest)
         return _are_along(0.5, cylinder, points[touching])
 
     @property

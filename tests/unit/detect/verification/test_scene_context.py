@@ -129,6 +129,18 @@ def test_a_wall_that_ends_beside_a_line_goes_on_to_it(gap: float, before: float,
     assert around.touches_wall(upright(0.0, -before * RADIUS)) is touches
 
 
+@pytest.mark.parametrize(
+    ("gap", "crossing", "touches"), [(0.15, 0.005, True), (0.25, 0.005, False), (0.15, 0.02, False)]
+)
+def test_a_wall_goes_on_farther_to_a_line_in_which_another_one_crosses_it(
+    gap: float, crossing: float, touches: bool
+) -> None:
+    """Of the floor at a wall's foot little was seen. `crossing`: distance of the axis from the other plane [m]."""
+    ends = wall([gap, 0.0, 0.0], [0.5, 0.0, 1.0])
+    around = surroundings(ends, planes=[Plane(AWAY, 0.0, 0.5), Plane(np.array([1.0, 0.0, 0.0]), 0.0, 0.1)])
+    assert around.touches_wall(upright(crossing, 0.0)) is touches
+
+
 @pytest.mark.parametrize(("low", "high", "rejected"), [(0.0, 1.0, True), (0.45, 1.0, True), (0.7, 1.0, False)])
 def test_the_rounding_of_a_corner_is_one_of_planes_that_are_seen_beside_it(
     low: float, high: float, rejected: bool
