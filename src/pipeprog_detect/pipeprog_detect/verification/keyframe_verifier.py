@@ -158,6 +158,9 @@ class KeyframeVerifier:
         that should have shown it, resolved by the cloud. Then it keeps its radius as well if that is planned, and that
         of a contour which is hardly seen is not. One that is not trusted, and whose contour has no planned radius, may
         show one side alone, or be too thick in the cloud for its own edges to be within the search.
+
+        A contour of which one limb is none, or which is hardly seen, gives way to one of a planned radius that the
+        cloud allows.
         """
         if not self.has_views:
             return MeasuredPipe.of_cloud(candidate) if trusted else None

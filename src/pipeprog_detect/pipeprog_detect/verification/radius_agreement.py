@@ -9,7 +9,7 @@ from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.refinement.contour_fit import ContourFit
 
 # They contradict each other where they differ by more than this many standard deviations, the cloud's noise included,
-# and agree where they differ by less than this many without it (one in twenty pipes is beyond that).
+# and agree where they differ by less than this many (one in twenty pipes is beyond that).
 CONTRADICTION, AGREEMENT = 4.0, 2.0
 # The cloud resolves a section of five times its noise, seen along a third of the way around [rad], whose radius it
 # knows to a twentieth: the edge of a box is round, too, to a cloud. Two faces lie a tenth of the radius off the circle
