@@ -211,7 +211,10 @@ def work(
 
 
 def _take(channel: Channel, waiting: deque[Command], patience: float | None) -> list[Command]:
-    """The commands that have come, after a wait for the first one, which now wait; EOFError once there are no more."""
+    """Appends all commands that have come to those waiting, and returns them; waits up to `patience` [s] for the first.
+
+    Raises EOFError when the other end is closed and no command is left.
+    """
     came: list[Command] = []
     while channel.poll(0.0 if came else patience):
         try:

@@ -164,8 +164,8 @@ class SceneContext:
         nearest = cylinder.radius + self.clearance
         along = [plane for plane in self.planes if abs(plane.normal @ cylinder.axis) < ALONG]
         through = [each.normal for each in along if abs(each.normal @ cylinder.middle - each.offset) < nearest]
-        is_corner = any(abs(one @ other) < CORNER for one, other in combinations(through, 2))
-        reach = nearest + (_FOOT if is_corner else _LEAST_BESIDE)
+        two_meet = any(abs(one @ other) < CORNER for one, other in combinations(through, 2))
+        reach = nearest + (_FOOT if two_meet else _LEAST_BESIDE)
         points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, reach)]
         foot = cylinder.at(cylinder.along(points) / cylinder.length)
         touching = np.linalg.norm(points - foot, axis=1) < nearest
