@@ -33,7 +33,7 @@ from pipeprog_sfm.types import EncodedImage
 
 LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neighbours on both sides
 SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits for no more than these
-PICTURES = 12  # of keyframes at working resolution, 11 MB each at 720p: neighbours are mostly the last few
+PICTURES = 12  # of keyframes at working resolution, 15 MB each at 720p: neighbours are mostly the last few
 NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
 # A keyframe of which the newest one sees less than this share is left behind: no nearer one comes any more.

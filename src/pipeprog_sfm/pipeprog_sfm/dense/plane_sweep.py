@@ -4,11 +4,16 @@
 Collins, "A space-sweep approach to true multi-image matching", 1996; Zabih and Woodfill, "Non-parametric local
 transforms for computing visual correspondence", 1994; Hirschmueller, "Stereo processing by semiglobal matching and
 mutual information", 2008. The cost is taken in the reference view straight from the poses, so no pair is rectified and
-baselines of any direction share one volume.
+baselines of any direction share one volume. From coarse to fine, each pixel tries what a sweep at half of the
+resolution has found around it, as do Rothermel et al., "SURE: photogrammetric surface reconstruction from imagery",
+2012: an eighth of the hypotheses.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import cv2
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -18,10 +23,33 @@ from pipeprog_sfm.dense.row_mapping import RowMapping, at_row
 RADIUS = 2  # of the census window, 24 comparisons: larger windows flatten pipes and fatten their edges
 PENALTY_SMALL = 6  # for a step of one hypothesis, of 48 = two views that differ in all comparisons
 PENALTY_LARGE = 48  # for a jump
-MAX_HYPOTHESES = 256  # bounds the memory, 5 bytes a pixel and hypothesis; beyond, steps get wider than a pixel
+MAX_HYPOTHESES = 256  # over the range; beyond, steps get wider than a pixel
+COARSE_HYPOTHESES = MAX_HYPOTHESES // 2  # of a sweep whose pixels are twice as wide
+# Pixels of the coarse depth around one, whose depths are tried: by RADIUS its windows widen what is in front.
+AROUND = RADIUS + 1
+# Hypotheses beyond those: what is too thin for the coarse sweep stands before what is seen behind it by 3 % of the
+# depth at most, as a pipe on its clamps.
+MARGIN = 8
+APART = 2  # unused cells between the hypotheses of two pixels: no path comes from them
+_BARRED = np.uint16(30000)  # their path cost, above all others: those are below 4 * PENALTY_LARGE
 OVERSAMPLING = 2  # of the neighbours, so that a rounded position is at most a quarter of a pixel off
 _BITS = (2 * RADIUS + 1) ** 2 - 1
 _UNSEEN = _BITS // 2  # cost of a view that does not see the point: no opinion
+
+
+class Hypotheses(NamedTuple):
+    """The inverse depths that each pixel tries: the d-th of pixel (u, v) is least + step * (starts[v, u] + d).
+
+    Attributes:
+        least, step: float32.
+        starts: (h, w) int32.
+        offsets: (h * w + 1,) int64, where those of a pixel begin in an array of all, with APART cells between them.
+    """
+
+    least: np.float32
+    step: np.float32
+    starts: NDArray[np.int32]
+    offsets: NDArray[np.int64]
 
 
 def sweep(
@@ -31,37 +59,67 @@ def sweep(
     epipoles: NDArray[np.float64],
     inverse_range: tuple[float, float],
     rows: RowMapping | None = None,
+    coarse: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """(h, w) inverse depth of the reference image, NaN at the ends of the range.
 
     `codes` (h, w) are its `census`, `others` (N, h2, w2) those of its neighbours, images of OVERSAMPLING times the
     resolution, low-passed alike; a pixel (u, v) of inverse depth i lies at the homogeneous pixel
     homographies[n] @ (u, v, 1) + i * epipoles[n] of them; with rolling `rows` that is so at the stamps, and inverse
-    depth is on the optical axis of each row's own pose.
+    depth is on the optical axis of each row's own pose. `coarse` (h / 2, w / 2) is what a sweep at half of the
+    resolution has found; without it the whole range is tried, in steps for one whose pixels are twice as wide.
     """
-    height, width = codes.shape
+    count = _count(codes.shape, homographies, epipoles, inverse_range)
+    if coarse is None:
+        count = min(count, COARSE_HYPOTHESES)
+        lowest, highest = np.zeros(codes.shape, np.int32), np.full(codes.shape, count - 1, np.int32)
     least, most = inverse_range
+    step = (most - least) / (count - 1)
+    if coarse is not None:
+        lowest, highest = _about((coarse - least) / step, codes.shape, count)
+    sizes = (highest - lowest).ravel().astype(np.int64) + 1
+    offsets = np.concatenate([[0], np.cumsum(sizes + APART)])
+    tried = Hypotheses(np.float32(least), np.float32(step), lowest, offsets)
+    views = codes, others, homographies.astype(np.float32), epipoles.astype(np.float32)
+    costs = _cost_volume(*views, tried, int(sizes.max()), rows)
+    index = _best(_aggregate(costs, tried, PENALTY_SMALL, PENALTY_LARGE), tried, count)
+    return (least + step * index).astype(np.float32)
+
+
+def _count(
+    shape: tuple[int, ...],
+    homographies: NDArray[np.float64],
+    epipoles: NDArray[np.float64],
+    inverse_range: tuple[float, float],
+) -> int:
+    """Number of hypotheses in steps of a pixel."""
+    height, width = shape
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float).T
     longest = 0.0  # track of a pixel over the range
     for homography, epipole in zip(homographies, epipoles, strict=True):
-        ends = [homography @ corners + inverse * epipole[:, None] for inverse in (least, most)]
+        ends = [homography @ corners + inverse * epipole[:, None] for inverse in inverse_range]
         if min(end[2].min() for end in ends) > 0:
             track = ends[1][:2] / ends[1][2] - ends[0][:2] / ends[0][2]
             longest = max(longest, float(np.linalg.norm(track, axis=0).max()) / OVERSAMPLING)
-    count = int(np.clip(np.ceil(longest) + 1, 8, MAX_HYPOTHESES))
-    step = (most - least) / (count - 1)
-    costs = _cost_volume(
-        codes,
-        others,
-        homographies.astype(np.float32),
-        epipoles.astype(np.float32),
-        np.float32(least),
-        np.float32(step),
-        count,
-        rows,
-    )
-    index = _best(_aggregate(costs, PENALTY_SMALL, PENALTY_LARGE))
-    return (least + step * index).astype(np.float32)
+    return int(np.clip(np.ceil(longest) + 1, 8, MAX_HYPOTHESES))
+
+
+def _about(
+    coarse: NDArray[np.float32], shape: tuple[int, ...], count: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """First and last hypothesis of each pixel (h, w): those `coarse` has around it, and MARGIN; or all.
+
+    `coarse` counts hypotheses.
+    """
+    kernel = np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)
+    known = np.isfinite(coarse)
+    low = cv2.erode(np.where(known, coarse, np.float32(count)).astype(np.float32), kernel)
+    high = cv2.dilate(np.where(known, coarse, np.float32(-1.0)).astype(np.float32), kernel)
+    nothing = high < low
+    low = np.where(nothing, 0.0, np.maximum(np.floor(low) - MARGIN, 0.0))
+    high = np.where(nothing, count - 1.0, np.minimum(np.ceil(high) + MARGIN, count - 1.0))
+    rows, columns = (np.minimum(np.arange(n) // 2, m - 1) for n, m in zip(shape, coarse.shape, strict=True))
+    return low.astype(np.int32)[rows[:, None], columns], high.astype(np.int32)[rows[:, None], columns]
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -82,24 +140,27 @@ def census(image, stride):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True, fastmath=True, error_model="numpy")
-def _cost_volume(census, others, homographies, epipoles, least, step, count, rows):  # type: ignore[no-untyped-def]
-    """(h, w, count) uint8: Hamming distances of the two best views, summed: occlusion on one side does not matter.
+def _cost_volume(census, others, homographies, epipoles, tried, most, rows):  # type: ignore[no-untyped-def]
+    """(offsets[-1],) uint8: Hamming distances of the two best views, summed: occlusion on one side does not matter.
 
-    Three loops over the hypotheses, because the compiler makes vector code of the first and the last alone: of a store
-    beside reads at computed places it cannot tell that they do not overlap. Without rolling `rows` (None) their branch
-    is not compiled.
+    A pixel tries `most` hypotheses at most. Three loops over them, because the compiler makes vector code of the first
+    and the last alone: of a store beside reads at computed places it cannot tell that they do not overlap. Without
+    rolling `rows` (None) their branch is not compiled.
     """
     height, width = census.shape
     number, other_height, other_width = others.shape
     codes = others.reshape(number, other_height * other_width)
-    costs = np.empty((height, width, count), np.uint8)
-    for v in prange(height):
-        places = np.empty(count, np.int32)
-        seen = np.empty(count, np.uint32)
-        first = np.empty(count, np.int32)
-        second = np.empty(count, np.int32)
+    costs = np.empty(tried.offsets[-1], np.uint8)
+    step = tried.step
+    for row in prange(height):
+        v = np.int64(row)  # prange counts unsigned
+        room = np.empty(most, np.int32), np.empty(most, np.uint32), np.empty(most, np.int32), np.empty(most, np.int32)
         turned, moved = np.empty((2, 3), np.float32)
         for u in range(width):
+            begin = tried.offsets[v * width + u]
+            count = tried.offsets[v * width + u + 1] - begin - APART
+            places, seen, first, second = room[0][:count], room[1][:count], room[2][:count], room[3][:count]
+            least = np.float32(tried.least + step * np.float32(tried.starts[v, u]))
             first[:] = 255
             second[:] = 255
             for n in range(number):
@@ -118,8 +179,9 @@ def _cost_volume(census, others, homographies, epipoles, least, step, count, row
                 _compare(census[v, u], seen, first, second)
             if number == 1:
                 second[:] = first
+            cost = costs[begin : begin + count]
             for d in range(count):
-                costs[v, u, d] = first[d] + second[d]
+                cost[d] = first[d] + second[d]
     return costs
 
 
@@ -204,84 +266,105 @@ def _compare(code, seen, first, second):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _aggregate(costs, penalty_small, penalty_large):  # type: ignore[no-untyped-def]
-    """(2, h, w, D) uint16: path costs from above (left, upper left, up, upper right) and, mirrored, from below."""
-    height, width, count = costs.shape
-    sums = np.empty((2, height, width, count), np.uint16)
+def _aggregate(costs, tried, penalty_small, penalty_large):  # type: ignore[no-untyped-def]
+    """(2, offsets[-1]) uint16: path costs from above (left, upper left, up, upper right) and, mirrored, from below."""
+    starts, offsets = tried.starts, tried.offsets
+    height, width = starts.shape
+    sums = np.empty((2, len(costs)), np.uint16)
+    longest = 0  # row of hypotheses
+    for v in range(height):
+        longest = max(longest, offsets[(v + 1) * width] - offsets[v * width])
     for half in prange(2):
-        above = np.zeros((3, width + 2, count), np.uint16)
-        here = np.zeros((3, width + 2, count), np.uint16)
-        above_least = np.zeros((3, width + 2), np.uint16)
-        here_least = np.zeros((3, width + 2), np.uint16)
-        left = np.zeros(count, np.uint16)
-        path = np.zeros(count, np.uint16)
+        # Path costs of two rows, four directions each, and their least ones; the rows take turns.
+        paths = np.full(8 * longest, _BARRED, np.uint16)
+        leasts = np.zeros((2, 4, width), np.uint16)
         for row in range(height):
             v = row if half == 0 else height - 1 - row
-            left[:] = 0
-            left_least = np.uint16(0)
+            above = v if row == 0 else (v - 1 if half == 0 else v + 1)
+            now, last = row % 2, 1 - row % 2
             for column in range(width):
                 u = column if half == 0 else width - 1 - column
-                cost = costs[v, u]
-                total = sums[half, v, u]
-                _extend(cost, left, left_least, path, penalty_small, penalty_large)
-                least = np.uint16(65535)
-                for d in range(count):
-                    value = path[d]
-                    left[d] = value
-                    total[d] = value
-                    least = min(least, value)
-                left_least = least
-                for k in range(3):
-                    source = column + k  # the padded columns of upper left, up and upper right
-                    out = here[k, column + 1]
-                    _extend(cost, above[k, source], above_least[k, source], out, penalty_small, penalty_large)
-                    least = np.uint16(65535)
-                    for d in range(count):
-                        value = out[d]
-                        total[d] += value
-                        least = min(least, value)
-                    here_least[k, column + 1] = least
-            for k in range(3):
-                here[k, 0] = here[k, 1]
-                here[k, width + 1] = here[k, width]
-                here_least[k, 0] = here_least[k, 1]
-                here_least[k, width + 1] = here_least[k, width]
-            above, here = here, above
-            above_least, here_least = here_least, above_least
+                pixel = v * width + u
+                size = offsets[pixel + 1] - offsets[pixel] - APART
+                for k in range(4):
+                    other_row, turn = (v, now) if k == 0 else (above, last)
+                    source = max(column - 1, 0) if k == 0 else min(max(column + k - 2, 0), width - 1)
+                    w = source if half == 0 else width - 1 - source
+                    other = other_row * width + w
+                    is_first = (column if k == 0 else row) == 0
+                    known = 0 if is_first else offsets[other + 1] - offsets[other] - APART
+                    shift = np.int64(starts[v, u]) - np.int64(starts[other_row, w])
+                    there = (4 * turn + k) * longest + 1 + offsets[other] - offsets[other_row * width]
+                    here = (4 * now + k) * longest + 1 + offsets[pixel] - offsets[v * width]
+                    leasts[now, k, u] = _extend(
+                        costs, offsets[pixel], size, paths, there, known, shift, leasts[turn, k, w], here,
+                        sums[half], k == 0, penalty_small, penalty_large,
+                    )  # fmt: skip
     return sums
 
 
+# Indices are unsigned, since the compiler makes no vector code of those that may count from the end.
 @njit(inline="always")
-def _extend(cost, path, least, out, penalty_small, penalty_large):  # type: ignore[no-untyped-def]
-    """Equation 13 of Hirschmueller: the path cost of a pixel from that of the pixel before."""
-    last = len(cost) - 1
-    small = np.uint16(penalty_small)
-    jump = np.uint16(least + np.uint16(penalty_large))
-    out[0] = np.uint16(cost[0] + min(min(path[0], np.uint16(path[1] + small)), jump) - least)
-    for d in range(1, last):
-        step = np.uint16(min(path[d - 1], path[d + 1]) + small)
-        out[d] = np.uint16(np.uint16(cost[d]) + min(min(path[d], step), jump) - least)
-    out[last] = np.uint16(cost[last] + min(min(path[last], np.uint16(path[last - 1] + small)), jump) - least)
+def _extend(  # type: ignore[no-untyped-def]
+    costs, begin, size, paths, there, known, shift, least, here, sums, is_first, penalty_small, penalty_large,
+):  # fmt: skip
+    """Equation 13 of Hirschmueller: the path costs of a pixel from those of the pixel before; returns the least one.
+
+    The pixel has `size` hypotheses from `begin` of the costs and the sums on, and its path costs go to paths[here:].
+    The pixel before has `known` path costs from `there` on, the least one of which is `least`; number `shift` of them
+    is of this pixel's first hypothesis. The sums are set if this `is_first` of them, else added to.
+    """
+    small, large = np.uint16(penalty_small), np.uint16(penalty_large)
+    jump = np.uint16(least + large)
+    low = min(max(-shift, 0), size)
+    high = max(min(known - shift, size), low)
+    if high - low < size:
+        for d in range(np.uintp(size)):
+            paths[np.uintp(here) + d] = np.uint16(costs[np.uintp(begin) + d] + large)
+    same, cost, path = np.uintp(there + low + shift), np.uintp(begin + low), np.uintp(here + low)
+    for d in range(np.uintp(high - low)):
+        step = np.uint16(min(paths[same + d - np.uintp(1)], paths[same + d + np.uintp(1)]) + small)
+        paths[path + d] = np.uint16(np.uint16(costs[cost + d]) + min(min(paths[same + d], step), jump) - least)
+    paths[np.uintp(here - 1)] = paths[np.uintp(here + size)] = _BARRED
+    path, total = np.uintp(here), np.uintp(begin)
+    lowest = np.uint16(65535)
+    if is_first:
+        for d in range(np.uintp(size)):
+            value = paths[path + d]
+            sums[total + d] = value
+            lowest = min(lowest, value)
+    else:
+        for d in range(np.uintp(size)):
+            value = paths[path + d]
+            sums[total + d] += value
+            lowest = min(lowest, value)
+    return lowest
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _best(sums):  # type: ignore[no-untyped-def]
+def _best(sums, tried, count):  # type: ignore[no-untyped-def]
     """(h, w) float32 index of the least sum, refined between its two neighbours; NaN at either end of the range."""
-    _, height, width, count = sums.shape
+    height, width = tried.starts.shape
     out = np.full((height, width), np.nan, np.float32)
-    for v in prange(height):
+    for row in prange(height):
+        v = np.int64(row)  # prange counts unsigned
         for u in range(width):
-            above, below = sums[0, v, u], sums[1, v, u]
+            begin, end = tried.offsets[v * width + u], tried.offsets[v * width + u + 1] - APART
+            above, below = sums[0, begin:end], sums[1, begin:end]
             # The least sum first and then its place: the compiler makes vector code of a loop without places.
             least = np.int32(1 << 30)
-            for d in range(count):
+            for d in range(end - begin):
                 least = min(least, np.int32(np.int32(above[d]) + np.int32(below[d])))
             best = 0
             while np.int32(above[best]) + np.int32(below[best]) != least:
                 best += 1
-            if 0 < best < count - 1:
+            index = tried.starts[v, u] + best
+            if not 0 < index < count - 1:
+                continue
+            out[v, u] = index
+            if 0 < best < end - begin - 1:
                 before = np.int32(above[best - 1]) + np.int32(below[best - 1])
                 after = np.int32(above[best + 1]) + np.int32(below[best + 1])
                 flank = max(before, after) - least
-                out[v, u] = best + (0.5 * (before - after) / flank if flank > 0 else 0.0)
+                out[v, u] += 0.5 * (before - after) / flank if flank > 0 else 0.0
     return out

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -60,6 +60,11 @@ class Picture:
     def codes(self) -> NDArray[np.uint32]:
         """(H, W) census as the sweep reads it of a neighbour."""
         return census(_low_pass(_without_shading(self.gray.astype(np.float32))), OVERSAMPLING)
+
+    @cached_property
+    def halved(self) -> Picture:
+        """The picture at half of its width."""
+        return Picture.reduced(self.color, self.camera, self.camera.width // 2)
 
     @cached_property
     def fours(self) -> NDArray[np.uint32]:
@@ -149,23 +154,12 @@ def depth_map(reference: StereoImage, neighbours: Sequence[StereoImage], depth_r
     if not neighbours:
         return DepthMap(reference.stamp, np.full((height, width), np.nan, np.float32), grid, color)
     gray = reference.picture.gray.astype(np.float32)
-    homographies, epipoles = [], []
-    for neighbour in neighbours:
-        other = neighbour.picture.camera.matrix
-        other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
-        homographies.append(other @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
-        epipoles.append(other @ other_from_reference[:3, 3])
-    homography, epipole = np.stack(homographies), np.stack(epipoles)
+    inverse_range = 1.0 / far, 1.0 / near
+    coarse = _swept([_halved(image) for image in (reference, *neighbours)], inverse_range)
+    inverse = _swept([reference, *neighbours], inverse_range, coarse)
+    homography, epipole = _homographies(reference, neighbours)
     rolled = _at_width(reference.rolled, camera.width)
     rows = None if rolled is None else _rows(rolled, reference, neighbours)
-    inverse = sweep(
-        census(cv2.pyrDown(_without_shading(gray)), 1),
-        np.stack([other.picture.codes for other in neighbours]),
-        homography @ np.diag([STRIDE, STRIDE, 1.0]),
-        epipole,
-        (1.0 / far, 1.0 / near),
-        None if rows is None else rows.thinned(STRIDE),
-    )
     others = np.stack([other.picture.fours for other in neighbours])
     inverse, correlation, sigma = refine(inverse, gray, others, homography, epipole, STRIDE, rows)
     known = (correlation >= CORRELATION_MIN) & (sigma <= SIGMA_MAX)
@@ -174,6 +168,40 @@ def depth_map(reference: StereoImage, neighbours: Sequence[StereoImage], depth_r
         depth, places = depth_at_the_stamp(depth, rolled, STRIDE)
         color = np.asarray(cv2.remap(color, places, None, cv2.INTER_LINEAR), np.uint8)
     return DepthMap(reference.stamp, depth, grid, color)
+
+
+def _swept(
+    images: Sequence[StereoImage], inverse_range: tuple[float, float], coarse: FloatImage | None = None
+) -> FloatImage:
+    """Inverse depth of every STRIDE-th pixel of the first image, matched with the others."""
+    reference, *neighbours = images
+    homographies, epipoles = _homographies(reference, neighbours)
+    rolled = _at_width(reference.rolled, reference.picture.camera.width)
+    return sweep(
+        census(cv2.pyrDown(_without_shading(reference.picture.gray.astype(np.float32))), 1),
+        np.stack([other.picture.codes for other in neighbours]),
+        homographies @ np.diag([STRIDE, STRIDE, 1.0]),
+        epipoles,
+        inverse_range,
+        None if rolled is None else _rows(rolled, reference, neighbours).thinned(STRIDE),
+        coarse,
+    )
+
+
+def _homographies(reference: StereoImage, neighbours: Sequence[StereoImage]) -> tuple[FloatArray, FloatArray]:
+    """(N, 3, 3) and (N, 3): a pixel x of inverse depth i lies at homographies[n] @ x + i * epipoles[n] of them."""
+    homographies, epipoles = [], []
+    inverse = np.linalg.inv(reference.picture.camera.matrix)
+    for neighbour in neighbours:
+        other = neighbour.picture.camera.matrix
+        other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
+        homographies.append(other @ other_from_reference[:3, :3] @ inverse)
+        epipoles.append(other @ other_from_reference[:3, 3])
+    return np.stack(homographies), np.stack(epipoles)
+
+
+def _halved(image: StereoImage) -> StereoImage:
+    return replace(image, picture=image.picture.halved)
 
 
 def _rows(rolled: RolledImage, reference: StereoImage, neighbours: Sequence[StereoImage]) -> RowMapping:

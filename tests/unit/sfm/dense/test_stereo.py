@@ -13,6 +13,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import StereoConfig
+from pipeprog_sfm.dense import plane_sweep
 from pipeprog_sfm.dense.stereo import Picture, StereoImage, choose_pairs, depth_map
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -47,7 +48,7 @@ def row_poses(camera_from_world, motion):
     return turn.as_matrix() @ camera_from_world[:3, :3], shift
 
 
-def cast(camera_from_world, camera=CAMERA, motion=None):
+def cast(camera_from_world, camera=CAMERA, motion=None, axis=AXIS, radius=RADIUS):
     """Depth along the optical axis and surface points (h, w, 3) of the wall and the pipe."""
     still = RowMotion(0.0, camera.height, np.zeros(3), np.zeros(3))
     rotations, shifts = row_poses(camera_from_world, motion or still)
@@ -57,15 +58,16 @@ def cast(camera_from_world, camera=CAMERA, motion=None):
     centre = -np.einsum("vij,vi->vj", rotations, shifts)[:, None]
     depth = (WALL - centre[..., 2]) / rays[..., 2]
     a = rays[..., 0] ** 2 + rays[..., 2] ** 2
-    b = rays[..., 0] * centre[..., 0] + rays[..., 2] * (centre[..., 2] - AXIS)
-    c = centre[..., 0] ** 2 + (centre[..., 2] - AXIS) ** 2 - RADIUS**2
+    b = rays[..., 0] * centre[..., 0] + rays[..., 2] * (centre[..., 2] - axis)
+    c = centre[..., 0] ** 2 + (centre[..., 2] - axis) ** 2 - radius**2
     hit = b * b - a * c > 0
     depth[hit] = ((-b - np.sqrt(np.where(hit, b * b - a * c, 0.0))) / a)[hit]
     return depth, centre + depth[..., None] * rays, hit
 
 
-def view(stamp, camera_from_world, motion=None):
-    gray = np.clip(texture(cast(camera_from_world, motion=motion)[1]), 0, 255).astype(np.uint8)
+def view(stamp, camera_from_world, motion=None, axis=AXIS, radius=RADIUS):
+    surface = cast(camera_from_world, motion=motion, axis=axis, radius=radius)[1]
+    gray = np.clip(texture(surface), 0, 255).astype(np.uint8)
     rolled = None if motion is None else RolledImage(motion, CAMERA)
     return StereoImage(stamp, Picture(np.repeat(gray[..., None], 3, axis=2), CAMERA), camera_from_world, rolled)
 
@@ -121,6 +123,30 @@ def test_a_rolling_shutter_costs_no_depth(layout):
     assert (np.abs(error[np.isfinite(error)]) > 0.05).mean() < 0.05
     still = depth_map(replace(reference, rolled=None), neighbours, RANGE)
     assert np.nanmedian(np.abs(still.depth - depth)[6:-6, 6:-6][wall]) > 0.006
+
+
+@pytest.mark.parametrize(("axis", "radius"), [(1.93, 0.012), (1.75, 0.02), (1.5, 0.03)])
+def test_few_hypotheses_tell_what_all_of_a_wide_range_do(monkeypatch, axis, radius):
+    """Pipes of 1.6 to 5 px of the sweep, half of that in the coarse one, before a wall."""
+    centre, others, _ = LAYOUTS["along the row"]
+    reference = view(0, pose(centre), axis=axis, radius=radius)
+    neighbours = [view(i + 1, pose(c), axis=axis, radius=radius) for i, c in enumerate(others)]
+    tried, about = [], plane_sweep._about
+
+    def counted(*arguments):
+        low, high = about(*arguments)
+        tried.append(float(np.mean(high - low + 1)))
+        return low, high
+
+    monkeypatch.setattr(plane_sweep, "_about", counted)
+    few = depth_map(reference, neighbours, (0.5, 15.0))
+    monkeypatch.setattr(plane_sweep, "MARGIN", plane_sweep.MAX_HYPOTHESES)
+    every = depth_map(reference, neighbours, (0.5, 15.0))
+    assert tried[0] < tried[1] / 3
+    depth, _, on_pipe = cast(reference.camera_from_world, few.camera, axis=axis, radius=radius)
+    for surface in (on_pipe, ~on_pipe):
+        right, possible = ((np.abs(found.depth - depth) < 0.02)[surface].mean() for found in (few, every))
+        assert right > 0.97 * possible
 
 
 def test_same_input_gives_the_same_bytes(scene):
