@@ -28,6 +28,8 @@ BEHIND_RADII = 1.2
 BESIDE, BEHIND_LIMB = 0.65, 0.5
 # A stretch whose contour is seen is no gap. It is looked at this often [px].
 SPACING = 6
+# Logarithm of the odds from which a contour is decisively none (Jeffreys: a hundred to one).
+REFUTED = float(np.log(100.0))
 # A known part without holes tells that a stretch is none where it is this many times as long: after k times its length
 # without one the next is a hole with a probability of 1 / (k + 2) (Laplace's rule of succession), one in four.
 DENSE = 2.0
@@ -40,8 +42,9 @@ def free_stretches(
 ) -> list[tuple[float, float]]:
     """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
 
-    A stretch whose contour is seen is a hole in the cloud of the pipe's face. But beyond a `known` part that is much
-    longer, and through less of which the views see, it is the contour of something in line with the pipe.
+    A stretch whose contour is seen is a hole in the cloud of the pipe's face, and so may one be of whose contour nothing
+    is seen: what hides it misleads stereo beside it. But beyond a `known` part that is much longer, and through less of
+    which the views see, a contour is that of something in line with the pipe, and where none is seen the pipe has ended.
 
     Args:
         cylinder: whose axis is looked at, and whose contour decides where stereo has holes.
@@ -50,12 +53,15 @@ def free_stretches(
         known: the pipe beyond whose end the cylinder lies.
     """
     stretches = _seen_through(cylinder, views, others)
-    excused = np.inf if known is None or not stretches else _holes(known, views, others)
-    longest = 0.0 if known is None else known.length / DENSE
+    supports = [Scene.of(cylinder.cut(*each), views, others).support(spacing=SPACING) for each in stretches]
+    if known is None:
+        refuted = [one.share < MIN_SUPPORT and one.log_odds().sum() < -REFUTED for one in supports]
+        return [each for each, is_free in zip(stretches, refuted, strict=True) if is_free]
+    holes = _holes(known, views, others) if stretches else 0.0
     return [
         (first, last)
-        for first, last in stretches
-        if excused < last - first < longest or not _shows_a_contour(cylinder.cut(first, last), views, others)
+        for (first, last), one in zip(stretches, supports, strict=True)
+        if one.share < MIN_SUPPORT or holes < last - first < known.length / DENSE
     ]
 
 
@@ -106,11 +112,6 @@ def _seen_through(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cy
     step = cylinder.length / count
     stretches = [(float(first * step), float(last * step)) for first, last in edges.reshape(-1, 2)]
     return [(first, last) for first, last in stretches if last - first > SHORTEST]
-
-
-def _shows_a_contour(stretch: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
-    """Whether the views show the contour of a stretch: then a hole in the cloud of its face let them through."""
-    return Scene.of(stretch, views, others).support(spacing=SPACING).share >= MIN_SUPPORT
 
 
 def _looked_through(

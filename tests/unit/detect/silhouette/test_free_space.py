@@ -66,6 +66,14 @@ def test_a_hidden_gap_is_not_told() -> None:
     assert free_stretches(line(0.03), views, [column]) == []
 
 
+def test_where_both_limbs_are_hidden_a_gap_is_not_told() -> None:
+    """Pipes before the limbs, 0.2 m nearer, leave the axis between them to be seen."""
+    views = seen(tube(-HALF, -0.1, 0.05), tube(0.1, HALF, 0.05))
+    rails = [Cylinder(np.array([-HALF, -0.2, z]), np.array([HALF, -0.2, z]), 0.02) for z in (-0.042, 0.042)]
+    assert free_stretches(line(0.05), views, [])
+    assert free_stretches(line(0.05), views, rails) == []
+
+
 def test_a_pipe_thinner_than_the_cells_is_not_judged() -> None:
     assert free_stretches(line(0.008), seen(), []) == []
 
