@@ -42,9 +42,10 @@ def free_stretches(
 ) -> list[tuple[float, float]]:
     """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
 
-    A stretch whose contour is seen is a hole in the cloud of the pipe's face, and so may one be of whose contour nothing
-    is seen: what hides it misleads stereo beside it. But beyond a `known` part that is much longer, and through less of
-    which the views see, a contour is that of something in line with the pipe, and where none is seen the pipe has ended.
+    Where its contour is seen a stretch is a hole in the cloud of the pipe's face. It may be one where nothing of the
+    contour is seen: what hides it misleads stereo beside it. But beyond a `known` part that is much longer, and through
+    less of which the views see, a contour is that of something in line with the pipe, and where none is seen the pipe
+    has ended.
 
     Args:
         cylinder: whose axis is looked at, and whose contour decides where stereo has holes.
