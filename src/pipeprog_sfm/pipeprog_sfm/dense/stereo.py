@@ -155,15 +155,16 @@ def depth_map(reference: StereoImage, neighbours: Sequence[StereoImage], depth_r
         return DepthMap(reference.stamp, np.full((height, width), np.nan, np.float32), grid, color)
     gray = reference.picture.gray.astype(np.float32)
     inverse_range = 1.0 / far, 1.0 / near
-    coarse = _swept([_halved(image) for image in (reference, *neighbours)], inverse_range)
-    inverse = _swept([reference, *neighbours], inverse_range, coarse)
-    homography, epipole = _homographies(reference, neighbours)
-    rolled = _at_width(reference.rolled, camera.width)
-    rows = None if rolled is None else _rows(rolled, reference, neighbours)
+    images = [reference, *neighbours]
+    halves = [replace(image, picture=image.picture.halved) for image in images]
+    homography, epipole, rows = geometry = _geometry(reference, neighbours)
+    coarse = _swept(halves, _geometry(halves[0], halves[1:]), inverse_range)
+    inverse = _swept(images, geometry, inverse_range, coarse)
     others = np.stack([other.picture.fours for other in neighbours])
     inverse, correlation, sigma = refine(inverse, gray, others, homography, epipole, STRIDE, rows)
     known = (correlation >= CORRELATION_MIN) & (sigma <= SIGMA_MAX)
     depth = np.where(known, 1.0 / np.where(known, inverse, 1.0), np.nan).astype(np.float32)
+    rolled = _at_width(reference.rolled, camera.width)
     if rolled is not None:
         depth, places = depth_at_the_stamp(depth, rolled, STRIDE)
         color = np.asarray(cv2.remap(color, places, None, cv2.INTER_LINEAR), np.uint8)
@@ -171,37 +172,42 @@ def depth_map(reference: StereoImage, neighbours: Sequence[StereoImage], depth_r
 
 
 def _swept(
-    images: Sequence[StereoImage], inverse_range: tuple[float, float], coarse: FloatImage | None = None
+    images: Sequence[StereoImage],
+    geometry: tuple[FloatArray, FloatArray, RowMapping | None],
+    inverse_range: tuple[float, float],
+    coarse: FloatImage | None = None,
 ) -> FloatImage:
-    """Inverse depth of every STRIDE-th pixel of the first image, matched with the others."""
+    """Inverse depth of every STRIDE-th pixel of the first image, matched with the others, of their `_geometry`."""
     reference, *neighbours = images
-    homographies, epipoles = _homographies(reference, neighbours)
-    rolled = _at_width(reference.rolled, reference.picture.camera.width)
+    homographies, epipoles, rows = geometry
     return sweep(
         census(cv2.pyrDown(_without_shading(reference.picture.gray.astype(np.float32))), 1),
         np.stack([other.picture.codes for other in neighbours]),
         homographies @ np.diag([STRIDE, STRIDE, 1.0]),
         epipoles,
         inverse_range,
-        None if rolled is None else _rows(rolled, reference, neighbours).thinned(STRIDE),
+        None if rows is None else rows.thinned(STRIDE),
         coarse,
     )
 
 
-def _homographies(reference: StereoImage, neighbours: Sequence[StereoImage]) -> tuple[FloatArray, FloatArray]:
-    """(N, 3, 3) and (N, 3): a pixel x of inverse depth i lies at homographies[n] @ x + i * epipoles[n] of them."""
+def _geometry(
+    reference: StereoImage, neighbours: Sequence[StereoImage]
+) -> tuple[FloatArray, FloatArray, RowMapping | None]:
+    """(N, 3, 3) homographies, (N, 3) epipoles and rolling rows of N neighbours, if the reference has any.
+
+    A pixel x of inverse depth i lies at homographies[n] @ x + i * epipoles[n] of them, with rolling rows at the stamps.
+    """
     homographies, epipoles = [], []
-    inverse = np.linalg.inv(reference.picture.camera.matrix)
+    camera = reference.picture.camera
     for neighbour in neighbours:
         other = neighbour.picture.camera.matrix
         other_from_reference = neighbour.camera_from_world @ np.linalg.inv(reference.camera_from_world)
-        homographies.append(other @ other_from_reference[:3, :3] @ inverse)
+        homographies.append(other @ other_from_reference[:3, :3] @ np.linalg.inv(camera.matrix))
         epipoles.append(other @ other_from_reference[:3, 3])
-    return np.stack(homographies), np.stack(epipoles)
-
-
-def _halved(image: StereoImage) -> StereoImage:
-    return replace(image, picture=image.picture.halved)
+    rolled = _at_width(reference.rolled, camera.width)
+    rows = None if rolled is None else _rows(rolled, reference, neighbours)
+    return np.stack(homographies), np.stack(epipoles), rows
 
 
 def _rows(rolled: RolledImage, reference: StereoImage, neighbours: Sequence[StereoImage]) -> RowMapping:
