@@ -216,7 +216,7 @@ def test_an_interrupt_ends_all_and_writes_nothing(tmp_path: Path, number: signal
     nodes = nodes_of(process.pid)
     process.send_signal(number)
     _, errors = process.communicate(timeout=PLAYING / 2)
-    assert process.returncode == code
+    assert process.returncode == code, errors
     assert "Traceback" not in errors
     assert ("Interrupted: nothing was written." in errors) == (number == signal.SIGINT)
     assert not (tmp_path / "out").exists()

@@ -30,6 +30,7 @@ from pipeprog_bringup.commands.score import score
 from pipeprog_bringup.commands.simulate_patrol import simulate_patrol
 from pipeprog_bringup.commands.speech import fail
 from pipeprog_bringup.commands.view import view
+from pipeprog_bringup.playback.interruption import repeated_signals
 
 _INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 _KEEPING = {"patrol", "simulate-patrol"}  # commands that cancel a survey after Ctrl-C, which leaves its folder
@@ -70,8 +71,9 @@ def main() -> None:
     # As for Ctrl-C, what was started is ended and what was half written is removed.
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        provide_user_folders()
-        code = app(prog_name="pipeprog", standalone_mode=False)
+        with repeated_signals():
+            provide_user_folders()
+            code = app(prog_name="pipeprog", standalone_mode=False)
     except (InputError, NodeFailure) as error:
         fail(str(error))
         sys.exit(1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C and SIGTERM are not lost in callbacks of C libraries."""
+"""Ctrl-C and SIGTERM are neither lost nor mistaken for an error in C libraries."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from types import FrameType
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_MADE_BY_C = (RuntimeError, SystemError, TypeError)  # pybind11's, and CPython's where a C function fails unexpectedly
 
 
 @contextlib.contextmanager
 def repeated_signals() -> Iterator[Callable[[], None]]:
     """Notes the signals that arrive; yields a function that raises them again.
 
-    What a signal's handler raises appears wherever the interpreter is at that moment: in a destructor, or in a callback
-    that C code calls, it is printed and forgotten. Who calls the function now and then ends nevertheless. Signals that
-    are ignored stay so, and outside the main thread, which gets no signals, nothing is noted.
+    What a signal's handler raises appears wherever the interpreter is at that moment. In a destructor, or in a callback
+    that C code calls, it is printed and forgotten: who calls the function now and then ends nevertheless. Where C code
+    makes Python objects, as rclpy does of a message's bytes, it ends as an error of that code, in whose place the
+    signal is raised again. Signals that are ignored stay so, and outside the main thread, which gets no signals,
+    nothing is noted.
     """
     caught: list[int] = []
     previous: dict[signal.Signals, Any] = {}
@@ -38,6 +41,9 @@ def repeated_signals() -> Iterator[Callable[[], None]]:
             signal.signal(number, note)
     try:
         yield repeat
+    except _MADE_BY_C:
+        repeat()
+        raise
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
