@@ -20,6 +20,7 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.silhouette.edge_support import COMMON, HIT_RATE, MIN_VIEWS
 from pipeprog_detect.silhouette.occlusion import BEFORE
+from pipeprog_detect.thin.depth_from_cloud import percentile
 from pipeprog_detect.thin.rectified_view import BLOCK, EDGE, UNKNOWN, RectifiedView, rectified_views
 from pipeprog_detect.threads import THREADS, mapped
 from pipeprog_detect.types import Cylinder, View
@@ -342,8 +343,8 @@ def _best_run(gains: FloatArray, weight: FloatArray) -> tuple[float, int, int]:
     seen = np.flatnonzero(weight[low:high] > 0.0) + low
     if not len(seen):
         return 0.0, 0, 0
-    level = LEVEL * np.percentile(gains[seen] / weight[seen], CLEARER)
-    clear = np.percentile(gains[seen], CLEARER)
+    level = LEVEL * percentile(gains[seen] / weight[seen], CLEARER)
+    clear = percentile(gains[seen], CLEARER)
     begin, end = _largest_sum(gains[low:high] - level * weight[low:high], max(ENDED, CLAMPED * clear))
     return gains[low + begin : low + end].sum(), low + begin, low + end
 

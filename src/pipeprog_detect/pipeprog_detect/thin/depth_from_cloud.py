@@ -228,12 +228,20 @@ def by_bin(cell: NDArray[np.int64], depth: NDArray[np.floating], bins: int, perc
         filled[cell[i]] += 1
     result = np.full(bins, np.nan)
     for one in range(bins):
-        members = np.sort(ordered[starts[one] : starts[one + 1]])
+        members = ordered[starts[one] : starts[one + 1]]
         if len(members) >= 3:
-            place = 0.01 * percent * (len(members) - 1)
-            below = min(int(place), len(members) - 2)
-            result[one] = members[below] + (place - below) * (members[below + 1] - members[below])
+            result[one] = percentile(members, percent)
     return result
+
+
+@njit(cache=True, nogil=True)
+def percentile(values: FloatArray, percent: float) -> float:
+    """As np.percentile of values (N,), none of them NaN and one at least; it compiles in less than half of the time."""
+    ordered = np.sort(values)
+    place = 0.01 * percent * (len(ordered) - 1)
+    below = int(place)
+    above = min(below + 1, len(ordered) - 1)
+    return ordered[below] + (place - below) * (ordered[above] - ordered[below])
 
 
 def robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:

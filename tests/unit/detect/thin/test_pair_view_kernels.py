@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.silhouette.apparent_contour import project
 from pipeprog_detect.thin import pair_views
-from pipeprog_detect.thin.depth_from_cloud import by_bin
+from pipeprog_detect.thin.depth_from_cloud import by_bin, percentile
 from pipeprog_detect.types import View
 
 RANDOM = np.random.default_rng(3)
@@ -21,6 +24,11 @@ def test_percentiles_of_bins() -> None:
     cell[:2] = 5  # fewer than three tell nothing
     expected = [np.percentile(depth[cell == k], 30.0) if (cell == k).sum() >= 3 else np.nan for k in range(13)]
     np.testing.assert_allclose(by_bin(cell, depth, 13, 30.0), expected, rtol=1e-6)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=20), st.floats(0.0, 100.0))
+def test_a_percentile_is_that_of_numpy(values: list[float], percent: float) -> None:
+    assert percentile(np.array(values), percent) == pytest.approx(np.percentile(values, percent), rel=1e-9, abs=1e-9)
 
 
 def test_points_in_a_view() -> None:
