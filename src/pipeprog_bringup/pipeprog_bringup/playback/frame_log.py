@@ -15,9 +15,15 @@ LOST_AFTER = 3  # keyframes in a row without a place in the map: one may be blur
 
 
 class FrameLog:
-    """Rows of frames.csv in the order of playing, filled by the decisions and the SfM's feedback as they come."""
+    """Rows of frames.csv in the order of playing, filled by the decisions and the SfM's feedback as they come.
+
+    Attributes:
+        chosen: number of keyframes.
+        beyond_limit: number of frames that would be keyframes, and the map may hold no more.
+    """
 
     def __init__(self) -> None:
+        self.chosen = self.beyond_limit = 0
         self._rows: list[FrameRow | None] = []
         self._pending: defaultdict[int, deque[int]] = defaultdict(deque)
         self._first: dict[int, int] = {}
@@ -33,16 +39,6 @@ class FrameLog:
     def considered(self) -> int:
         """Frames that were decided on."""
         return len(self._rows) - self.in_flight
-
-    @property
-    def chosen(self) -> int:
-        """Keyframes."""
-        return sum(row is not None and row.chosen for row in self._rows)
-
-    @property
-    def beyond_limit(self) -> int:
-        """Frames that would be keyframes, and the map may hold no more."""
-        return sum(row is not None and row.reason == FULL for row in self._rows)
 
     def play(self, stamp: int) -> None:
         """A frame was sent to the selector."""
@@ -62,11 +58,11 @@ class FrameLog:
         """A decision came; a second one about the same frame replaces the first."""
         waiting = self._pending.get(row.stamp)
         if waiting:
-            self._rows[waiting.popleft()] = row
+            self._fill(waiting.popleft(), row)
             if not waiting:
                 del self._pending[row.stamp]
         elif row.stamp in self._first:
-            self._rows[self._first[row.stamp]] = row
+            self._fill(self._first[row.stamp], row)
 
     def overlap(self, stamp: int, overlap: float, cell_overlap: float, tie_points: int, registered: bool) -> None:
         """The SfM reported the overlap of a keyframe: Ov_N (Eq. 1), and the share of the image's cells."""
@@ -97,6 +93,11 @@ class FrameLog:
         frames = [f"{len(group)} frames left out: {self._named(group[0])}" for _, group in groups]
         motion = sorted(self._motion_lost.items())
         return frames + [f"{count} messages of {topic} left out: damaged" for topic, count in motion]
+
+    def _fill(self, number: int, row: FrameRow) -> None:
+        before, self._rows[number] = self._rows[number], row
+        self.chosen += row.chosen - (before is not None and before.chosen)
+        self.beyond_limit += (row.reason == FULL) - (before is not None and before.reason == FULL)
 
     def _reasons(self) -> dict[str, list[int]]:
         """The frames that were not chosen, by what their reasons begin with: the rest differs from frame to frame."""

@@ -94,7 +94,7 @@ class Journal:
     @property
     def end(self) -> int:
         """The number after the last command's."""
-        return max(self._offsets, default=-1) + 1
+        return next(reversed(self._offsets), -1) + 1
 
     def write(self, number: int, command: Any, waits: bool = False) -> None:
         """Writes a command, which may wait for an answer; raises OSError where there is no place for it."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import pytest
 
-from pipeprog_bringup.playback.frame_log import LOST_AFTER, LiveFrameLog
+from pipeprog_bringup.playback.frame_log import LOST_AFTER, FrameLog, LiveFrameLog
 from pipeprog_bringup.results.result_files import FrameRow
+from pipeprog_frames.frame_decision import FULL
 
 
 def log_of(*registered: bool | None) -> LiveFrameLog:
@@ -49,3 +50,16 @@ def test_frames_that_are_not_chosen_and_repeated_decisions_do_not_count_as_keyfr
     log.decide(FrameRow(99, False, "blurred"))
     assert log.is_tracking
     assert (log.considered, log.chosen) == (LOST_AFTER, LOST_AFTER - 1)
+
+
+def test_a_decision_that_replaces_another_is_counted_in_its_place() -> None:
+    log = FrameLog()
+    for stamp in (1, 2):
+        log.play(stamp)
+    log.skip(3, "damaged message")
+    for row in (FrameRow(1, True, "overlap"), FrameRow(2, False, FULL), FrameRow(1, False, FULL)):
+        log.decide(row)
+    assert (log.chosen, log.beyond_limit) == (0, 2)
+    log.decide(FrameRow(2, True, "overlap"))
+    assert (log.chosen, log.beyond_limit) == (1, 1)
+    assert [row.chosen for row in log.rows()] == [False, True, False]
