@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -50,7 +50,20 @@ def test_light_that_goes_on_beside_a_step_is_the_steps_or_the_textures(
     line = Cylinder(np.array([SHADOW, WALL, -0.2]), np.array([SHADOW, WALL, 0.2]), 0.0086)
     scene = Scene.of(line, empty_views, [])
     inwards = np.where(scene.samples().side == 0, 24.0, beyond)
+    monkeypatch.setattr(Scene, "support", lambda *_: Support(0.0))
     monkeypatch.setattr(Scene, "light", stepping(inwards, texture))
+    assert is_one_step(scene) is is_step
+
+
+@pytest.mark.parametrize(("step", "odds", "is_step"), [(4.0, -20.0, True), (4.0, -5.0, False), (8.0, -20.0, False)])
+def test_a_step_that_the_edges_speak_against_is_the_textures(
+    step: float, odds: float, is_step: bool, empty_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the other side the light steps by 24 grey levels, in the same direction."""
+    line = Cylinder(np.array([SHADOW, WALL, -0.2]), np.array([SHADOW, WALL, 0.2]), 0.0086)
+    scene = Scene.of(line, empty_views, [])
+    monkeypatch.setattr(Scene, "support", lambda *_: Support(odds))
+    monkeypatch.setattr(Scene, "light", stepping(np.where(scene.samples().side == 0, 24.0, step), 0.0))
     assert is_one_step(scene) is is_step
 
 
@@ -93,18 +106,20 @@ def test_a_pipe_that_turns_from_darker_to_brighter_than_what_is_behind_it_has_tw
     behind = np.where(samples.along > np.median(samples.along), 24.0, -24.0)
     inwards = np.where(samples.side == 0, 24.0, behind)
     monkeypatch.setattr(Scene, "samples", lambda *_, **__: samples)
-    monkeypatch.setattr(Scene, "support", lambda *_: NoSupport())
+    monkeypatch.setattr(Scene, "support", lambda *_: Support(0.0))
     monkeypatch.setattr(Scene, "light", stepping(inwards, 0.0))
     assert not is_one_step(scene)
 
 
-class NoSupport:
-    """Of both sides."""
+@dataclass
+class Support:
+    """Stands for that of a contour of which no share of the second side is supported, with these log odds there."""
 
+    odds: float
     weaker_share = 0.0
 
     def log_odds(self) -> np.ndarray:
-        return np.zeros((1, 2))
+        return np.array([[0.0, self.odds]])
 
 
 @pytest.mark.parametrize(("inside", "is_strip"), [(None, True), (60.0, False)])
