@@ -20,7 +20,7 @@ from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.silhouette.edge_support import COMMON, HIT_RATE, MIN_VIEWS
 from pipeprog_detect.silhouette.occlusion import BEFORE
-from pipeprog_detect.thin.depth_from_cloud import percentile
+from pipeprog_detect.thin.percentiles import percentile
 from pipeprog_detect.thin.rectified_view import BLOCK, EDGE, UNKNOWN, RectifiedView, rectified_views
 from pipeprog_detect.threads import THREADS, mapped
 from pipeprog_detect.types import Cylinder, View

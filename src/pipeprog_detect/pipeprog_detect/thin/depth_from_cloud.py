@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.silhouette.apparent_contour import ViewArrays
+from pipeprog_detect.thin.percentiles import by_bin
 from pipeprog_detect.types import Cylinder, View
 
 # Width of the strip of cloud beside a thin pipe that it is compared with, in its own widths.
@@ -212,36 +213,6 @@ def _seen_along(
             row[count], seen[0, count], seen[1, count], seen[2, count] = i, place, aside, far
             count += 1
     return row[:count].copy(), seen[0, :count].copy(), seen[1, :count].copy(), seen[2, :count].copy()
-
-
-@njit(cache=True, nogil=True)
-def by_bin(cell: NDArray[np.int64], depth: NDArray[np.floating], bins: int, percent: float) -> FloatArray:
-    """Percentile (B,) of the depths in each bin, NaN with fewer than three."""
-    starts = np.zeros(bins + 1, np.int64)
-    for i in range(len(cell)):
-        starts[cell[i] + 1] += 1
-    starts[:] = np.cumsum(starts)
-    filled = starts[:bins].copy()
-    ordered = np.empty(len(cell))
-    for i in range(len(cell)):
-        ordered[filled[cell[i]]] = depth[i]
-        filled[cell[i]] += 1
-    result = np.full(bins, np.nan)
-    for one in range(bins):
-        members = ordered[starts[one] : starts[one + 1]]
-        if len(members) >= 3:
-            result[one] = percentile(members, percent)
-    return result
-
-
-@njit(cache=True, nogil=True)
-def percentile(values: FloatArray, percent: float) -> float:
-    """As np.percentile of values (N,), none of them NaN and one at least; it compiles in less than half of the time."""
-    ordered = np.sort(values)
-    place = 0.01 * percent * (len(ordered) - 1)
-    below = int(place)
-    above = min(below + 1, len(ordered) - 1)
-    return ordered[below] + (place - below) * (ordered[above] - ordered[below])
 
 
 def robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, contour_samples
 from pipeprog_detect.silhouette.occlusion import cylinder_rows, depth_of_cylinders
-from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, by_bin, robust_line
+from pipeprog_detect.thin.depth_from_cloud import BESIDE_REACH, robust_line
 from pipeprog_detect.thin.line_segments import SegmentPairs, segment_pairs, straight_edges
+from pipeprog_detect.thin.percentiles import by_bin
 from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.silhouette.apparent_contour import project
 from pipeprog_detect.thin import pair_views
-from pipeprog_detect.thin.depth_from_cloud import by_bin, percentile
+from pipeprog_detect.thin.percentiles import by_bin, percentile
 from pipeprog_detect.types import View
 
 RANDOM = np.random.default_rng(3)
