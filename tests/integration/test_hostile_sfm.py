@@ -179,3 +179,11 @@ def test_hostile_messages_leave_the_map_as_it_would_be(peer: Peer) -> None:
     for stamp, pose in zip(expected.trajectory.stamps.tolist(), expected.trajectory.map_from_camera, strict=True):
         assert np.linalg.norm(places[stamp] - pose[:3, 3]) < 0.002  # m, a thousandth of the distance to the board
     assert peer.points.width == pytest.approx(len(expected.cloud.points), rel=0.02)
+
+    # Whoever asks once more, for the answer was lost, gets the same map, not another one to be measured anew.
+    again = peer.finish()
+    assert (again.success, again.outputs) == (True, answer.outputs)
+    peer.publish(TOPICS[0], messages.compressed_image(stamp + 1, "camera_optical", encoded))
+    peer.publish(TOPICS[1], messages.info_from_camera(camera, stamp + 1, "camera_optical"))
+    peer.wait_for(partial(peer.answered.__contains__, stamp + 1))
+    assert peer.finish().outputs > answer.outputs

@@ -300,6 +300,8 @@ class SfmNode(Node):
         self._seen = self._last_stamp = 0
         self._camera_frame = ""  # of the newest keyframe
         self._finish_sent = False
+        self._finishing_at = (0, 0)  # `_commands` when the last map was asked for
+        self._finished_at: tuple[int, int] | None = None  # the same, once that map has been sent
         self._is_journalled = journal is not None
         known, retired = (None, None) if journal is None else self._take_up(journal)
         self._keyframes = KeyframeInput(self._intake, self._on_keyframe, known=known)
@@ -359,7 +361,19 @@ class SfmNode(Node):
         self._retiring.append(retirement)
         self._supervision.send(Retire(retirement.stamps))
 
+    @property
+    def _commands(self) -> tuple[int, int]:
+        """Keyframes and retirements that have come."""
+        return self._seen, self._retired + len(self._retiring)
+
     def _begin_finish(self) -> None:
+        """A further request with no keyframe between is answered with the map of the one before.
+
+        Its client may not have heard the answer; another map of the same keyframes would be measured anew.
+        """
+        if self._finish.is_due and self._finished_at == self._commands:
+            self._finish.answer(self._output.revision)
+            return
         self._finish_sent = False
         self._finish_when_complete()
 
@@ -369,6 +383,7 @@ class SfmNode(Node):
             if self._supervision.problem:
                 self._finish.answer(self._output.revision, self._supervision.problem)
             else:
+                self._finishing_at = self._commands
                 self._supervision.request(Finish(self._motion.take(), self._colmap))
 
     def _start_worker(self, answered: Iterable[AddKeyframe | Retire]) -> WorkerProcess:
@@ -399,6 +414,7 @@ class SfmNode(Node):
         self._publish_status()
         if isinstance(event, Finished):
             self._supervision.fulfilled()
+            self._finished_at = None if event.problem else self._finishing_at
             self._finish.answer(self._output.revision, event.problem)
 
     def _publish_transform(self, trajectory: Trajectory) -> None:
