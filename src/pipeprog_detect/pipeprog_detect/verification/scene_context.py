@@ -119,7 +119,8 @@ class SceneContext:
 
         The contour is where the line of sight touches the cylinder, beside its axis and hardly nearer: a wall whose
         own face is nearer than the axis on both sides would hide both lines. The depth that the views tell may be
-        wrong by a share of the radius, and the axis of a pipe on a wall is a whole radius before it.
+        wrong by a share of the radius, and the axis of a pipe on a wall is a whole radius before it. What counts is the
+        wall next to the lines: beside a pipe that is looked at aslant it comes nearer farther away.
         """
         sideways, depth = frame(cylinder, towards)
         reach = _reach_beside(cylinder)
@@ -132,10 +133,10 @@ class SceneContext:
         told = buried = 0
         for step in range(bins):
             beside = (place == step) & (np.abs(aside) > cylinder.radius) & (np.abs(aside) < reach)
-            flanks = [behind[beside & (side * aside > 0)] for side in (-1.0, 1.0)]
-            if all(len(flank) >= _LEAST_POINTS for flank in flanks):
+            flanks = [beside & (side * aside > 0) for side in (-1.0, 1.0)]
+            if all(flank.sum() >= _LEAST_POINTS for flank in flanks):
                 told += 1
-                buried += all(np.median(flank) < surface for flank in flanks)
+                buried += all(np.median(_next_to(np.abs(aside[flank]), behind[flank])) < surface for flank in flanks)
         return told >= _TOLD * bins and buried > 0.5 * told
 
     def is_covered(self, cylinder: Cylinder, radius_sigma: float, towards: FloatArray) -> bool:
@@ -191,6 +192,12 @@ class SceneContext:
         distance = np.linalg.norm(radial, axis=1)
         near = np.abs(distance - cylinder.radius) < 3.0 * candidate.band
         return rows[near], radial[near] / (distance[near] + 1e-12)[:, None]
+
+
+def _next_to(aside: FloatArray, behind: FloatArray) -> FloatArray:
+    """Of N >= `_LEAST_POINTS` points those (K,) `behind` within a step of the least distance `aside` [m] of a few."""
+    least = np.partition(aside, _LEAST_POINTS - 1)[_LEAST_POINTS - 1]
+    return behind[aside <= least + _STEP]
 
 
 def _reach_beside(cylinder: Cylinder) -> float:

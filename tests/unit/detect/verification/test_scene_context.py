@@ -68,6 +68,12 @@ def test_the_line_where_two_walls_meet_is_embedded_and_a_pipe_before_it_is_not()
     assert not corner.is_embedded(upright(-0.5 + RADIUS, -RADIUS), 1e-4, aslant)
 
 
+def test_a_thick_pipe_near_a_corner_looked_at_aslant_is_not_embedded() -> None:
+    """Both walls come nearer than its axis, but only far beside it: a DN200 before its wall was taken for a part."""
+    thick = upright(-0.27, -0.14, 0.1095)
+    assert not surroundings(BACK, SIDE).is_embedded(thick, 3e-4, np.array([-0.37, 0.93, 0.0]))
+
+
 def test_a_wall_that_goes_through_a_pipe_or_before_it_covers_it_and_one_that_touches_it_does_not() -> None:
     """As the face of a duct, of which the edge was taken for a contour, and that of a wall that carries the pipe."""
     radius = 0.0579
