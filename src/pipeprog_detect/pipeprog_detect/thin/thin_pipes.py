@@ -14,6 +14,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.chromaticity import DISPLACED
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.thin.axis_sweep import SAME_LINE, propose_parallel
@@ -37,6 +38,8 @@ MOSTLY_SEEN = 0.5
 TOUCHING = 2.0
 # Their axes are known to this [m].
 AXIS_SIGMA = 1e-3
+# Views that tell whether two lines are one: from three heights three each.
+RIVAL_VIEWS = 9
 
 
 def find_thin_pipes(
@@ -129,13 +132,20 @@ class _Search:
         return is_known(cylinder, self.known) or self._is_rival(cylinder, views)
 
     def _is_rival(self, cylinder: Cylinder, views: Sequence[View]) -> bool:
-        """Whether the views show it, or most of it, where they show a thin pipe: only one can be there."""
-        centre = mean_centre(cylinder, views)
+        """Whether most views show it, or most of it, where they show a thin pipe: only one can be there.
+
+        From one height another pipe behind it may look so, too, but not from another.
+        """
         most = 0.5 * cylinder.length
-        return centre is not None and any(
-            covers(each, cylinder, centre, SAME_LINE, 0.0) or covers(each, cylinder, centre, TOUCHING, most)
-            for each in self.known
-            if each.radius < self.thickest
+        thin = [each for each in self.known if each.radius < self.thickest]
+        centres = [view.centre for view in views_showing(cylinder.middle[None], views, RIVAL_VIEWS)] if thin else []
+        return any(
+            sum(
+                covers(each, cylinder, centre, SAME_LINE, 0.0) or covers(each, cylinder, centre, TOUCHING, most)
+                for centre in centres
+            )
+            > 0.5 * len(centres)
+            for each in thin
         )
 
     def _is_no_pipe(self, cylinder: Cylinder, views: Sequence[View]) -> bool:

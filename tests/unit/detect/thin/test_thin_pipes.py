@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.cloud.plane_segmentation import Plane
@@ -80,6 +81,25 @@ def test_only_what_looks_like_a_known_pipe_is_its_rival() -> None:
     beyond = thin.shifted((known.length + 0.01) * known.axis)
     assert not search._is_rival(beyond, views)
     assert not search._is_rival(thin.shifted(np.array([0.0, 0.0, 0.1])), views)
+
+
+def test_a_pipe_behind_another_one_is_no_rival_where_views_from_two_heights_part_them() -> None:
+    tree = octree.build(np.zeros((1, 3)))
+    around = SceneContext(tree, None, [], tree, 1e-3)
+    search = _Search(np.zeros((1, 3), np.float32), around, 0.03, [], BOQ, [replace(level(1.0), radius=0.0086)])
+    behind = replace(level(0.8), radius=0.0086).shifted(np.array([0.0, 0.24, 0.0]))
+    one_height = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    lower, higher = (
+        [replace(view, camera_from_map=_raised(view.camera_from_map, by)) for view in one_height] for by in (-0.3, 0.3)
+    )
+    assert search._is_rival(behind, one_height)
+    assert not search._is_rival(behind, lower + one_height + higher)
+
+
+def _raised(pose: FloatArray, by: float) -> FloatArray:
+    raised: FloatArray = pose.copy()
+    raised[:3, 3] -= pose[:3, :3] @ np.array([0.0, 0.0, by])
+    return raised
 
 
 def test_both_kinds_of_images_tell_the_radius() -> None:
