@@ -34,6 +34,7 @@ from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.open_ends import with_open_ends
 from pipeprog_detect.verification.parallel_to_wall import parallel_to_wall
+from pipeprog_detect.verification.parted_by_walls import parted_by_walls
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import with_ends_on_walls
 
@@ -157,6 +158,7 @@ def detect_outside(
     # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
     criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
     measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
+    measured = parted_by_walls(measured, around, judging, verifier)
     judging, coloured = _with_blur(judging, measured), in_colour(judging)
     points = (prepared.points if judging else prepared.points[:0]).astype(np.float32)  # for what is judged in the views
 
@@ -181,7 +183,8 @@ def detect_outside(
     measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)
     measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
     # Ends on either side of what hides a pipe may be expected beyond each other: then both pieces are of one pipe.
-    whole = joined(with_open_ends(joined(measured, judging), around, judging), judging, overlapping=True)
+    whole = with_open_ends(joined(measured, judging, context=around), around, judging)
+    whole = joined(whole, judging, overlapping=True, context=around)
     whole = _judged(whole, judging, has_two_edges)
     ended = _abutted(with_grown_ends(whole, judging), around, judging)
     standing = [each for each in ended if not is_hanger(each, prepared.points)]

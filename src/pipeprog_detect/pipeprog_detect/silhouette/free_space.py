@@ -17,11 +17,14 @@ from pipeprog_detect.types import Cylinder, View
 
 # Distance [m] between the positions looked at: less than a cell of a view's depths (8 px: 16 mm at 2 m with 1000 px).
 STEP = 0.01
-# A position is free where at least three views, and more than half of those that look at it, see what is behind it:
-# stereo is wrong in one view, not in three from different places.
-MIN_VIEWS, MIN_SHARE = 3, 0.5
+# A stretch is free where at least three views, two and more at each position, and more than half of those that look at
+# it, see what is behind it: stereo is wrong in one view, not in three from different places.
+MIN_VIEWS, MIN_AT_ONCE, MIN_SHARE = 3, 2, 0.5
 # What is seen lies behind where it is farther from the axis than the inside of an open end, one radius, and a fifth.
 BEHIND_RADII = 1.2
+# What stands out from where the barrel would be by more than this [m] is before it: stereo spreads edges by a
+# centimetre.
+STANDING_OUT = 0.015
 # Beside the axis they are looked at here, in radii: as far from it as a cell of a view's depths allows, which must lie
 # within the limb. The barrel is three quarters of the radius before its axis there; what lies behind the axis by half
 # of the radius is none of it.
@@ -102,32 +105,35 @@ def _seen_through(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cy
     along = (np.arange(count) + 0.5) * cylinder.length / count
     points = cylinder.start + along[:, None] * cylinder.axis
     rows = cylinder_rows(others)
-    behind, before = np.zeros(count), np.zeros(count)
+    behind: NDArray[np.bool_] = np.zeros((0, count), bool)
+    before: FloatArray = np.zeros(count)
     for index in np.flatnonzero(ViewArrays.of(views).showing(points)) if views else ():
-        view = views[index]
-        through, opaque = _looked_through(points, cylinder.radius, view, rows)
-        behind += through
-        before += opaque
-    free = (behind >= MIN_VIEWS) & (behind > MIN_SHARE * (behind + before))
-    edges = np.flatnonzero(np.diff(np.r_[False, free, False].astype(np.int8)))
+        through, opaque = _looked_through(points, cylinder.radius, views[index], rows)
+        behind, before = np.vstack([behind, through]), before + opaque
+    seen = behind.sum(axis=0)
+    free = (seen >= MIN_AT_ONCE) & (seen > MIN_SHARE * (seen + before))
+    edges = np.flatnonzero(np.diff(np.r_[False, free, False].astype(np.int8))).reshape(-1, 2)
     step = cylinder.length / count
-    stretches = [(float(first * step), float(last * step)) for first, last in edges.reshape(-1, 2)]
-    return [(first, last) for first, last in stretches if last - first > SHORTEST]
+    return [
+        (float(first * step), float(last * step))
+        for first, last in edges
+        if (last - first) * step > SHORTEST and behind[:, first:last].any(axis=1).sum() >= MIN_VIEWS
+    ]
 
 
 def _looked_through(
     points: FloatArray, radius: float, view: View, others: FloatArray
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Masks (N,) of the points (N, 3) behind which the view sees a surface, and before or at which it sees one.
+    """Masks (N,) of the points (N, 3) behind which the view sees a surface, and at which it sees one.
 
     A view tells where the cell of its depths would lie within the silhouette of a pipe of `radius` [m]: of thinner ones
-    stereo shows the wall behind them.
+    stereo shows the wall behind them. What is nearer than the pipe's barrel would be hides the point.
     """
     through, opaque = np.zeros(len(points), bool), np.zeros(len(points), bool)
     looked, depth, nearest = _seen_at(points, radius, view, others)
     behind = depth + max(BEFORE, BEHIND_RADII * radius)
     through[looked] = nearest > behind
-    opaque[looked] = nearest <= behind
+    opaque[looked] = (nearest <= behind) & (nearest > depth - radius - STANDING_OUT)
     return through, opaque
 
 

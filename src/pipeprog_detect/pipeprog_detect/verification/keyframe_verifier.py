@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -113,25 +112,46 @@ class KeyframeVerifier:
         cloud, and one side of a pipe like that of a thinner one.
         """
         order = sorted(range(len(candidates)), key=lambda number: -candidates[number].points)
-        current = {(number, 0): candidates[number].cylinder for number in order if trusted[number]}  # and piece
-        found: dict[tuple[int, int], MeasuredPipe] = {}
+        waiting = {number: candidates[number].cylinder for number in order if trusted[number]}
+        found: list[tuple[MeasuredPipe, bool]] = []
         for number in order:
-            others = [cylinder for (other, _), cylinder in current.items() if other != number]
-            measured = self._measured(candidates[number], others, trusted[number])
-            if measured is None:
-                continue
-            around = [place for place, known in found.items() if known.cylinder.contains(measured.cylinder.middle)]
-            if not all(_is_refuted(found[place], measured) for place in around):
-                continue
-            for place in around:
-                del found[place], current[place]
-            pieces = self._pieces(measured, others, trusted[number])
-            if not pieces:
-                current.pop((number, 0), None)
-            places = {(number, index): piece for index, piece in enumerate(pieces)}
-            current |= {place: piece.cylinder for place, piece in places.items()}
-            found |= places
-        return list(found.values())
+            waiting.pop(number, None)
+            others = [*waiting.values(), *(known.cylinder for known, _ in found)]
+            measured = self.measured(candidates[number], others, trusted[number])
+            if measured is not None:
+                for piece in self._pieces(measured, others, trusted[number]):
+                    found = self._with(piece, trusted[number], found, list(waiting.values()))
+        # What the cloud took for one may have hidden a gap before all were known.
+        pipes = []
+        for place, (pipe, is_trusted) in enumerate(found):
+            others = [known.cylinder for known, _ in found[:place] + found[place + 1 :]]
+            pipes += self._pieces(pipe, others, is_trusted)
+        return pipes
+
+    def _with(
+        self,
+        piece: MeasuredPipe,
+        trusted: bool,
+        found: Sequence[tuple[MeasuredPipe, bool]],
+        waiting: Sequence[Cylinder],
+    ) -> list[tuple[MeasuredPipe, bool]]:
+        """The pipes found, each with whether it is trusted, and a piece that lies in none of them, or refutes them.
+
+        What is left of one that it refutes, beyond its own ends, is measured anew: it may be a pipe in line with it.
+        """
+        middle = piece.cylinder.middle
+        around = [each for each in found if each[0].cylinder.contains(middle)]
+        if not all(_is_refuted(known, piece) for known, _ in around):
+            return list(found)
+        kept = [each for each in found if not each[0].cylinder.contains(middle)]
+        kept.append((piece, trusted))
+        for known, is_trusted in around:
+            for rest in _beyond(known, piece.cylinder):
+                others = [*waiting, *(other.cylinder for other, _ in kept)]
+                again = self.measured(rest, others, is_trusted)
+                if again is not None and not any(each.cylinder.contains(again.cylinder.middle) for each, _ in kept):
+                    kept.append((again, is_trusted))
+        return kept
 
     def _pieces(self, measured: MeasuredPipe, others: Sequence[Cylinder], trusted: bool) -> list[MeasuredPipe]:
         """The pipe itself, or what lies between the stretches at which the views see through it, measured anew."""
@@ -140,18 +160,11 @@ class KeyframeVerifier:
         if not free:
             return [measured]
         bounds = [0.0, *(end for stretch in free for end in stretch), whole.length]
-        pieces = []
-        for low, high in zip(bounds[::2], bounds[1::2], strict=True):
-            if high - low > LEAST_STUB * whole.radius:
-                share = (high - low) / whole.length
-                points = int(share * measured.candidate.points)
-                candidate = replace(measured.candidate, cylinder=whole.cut(low, high), points=points)
-                piece = self._measured(candidate, others, trusted)
-                if piece is not None:
-                    pieces.append(piece)
-        return pieces
+        parts = [measured.part(*each) for each in zip(bounds[::2], bounds[1::2], strict=True)]
+        pieces = (self.measured(part, others, trusted) for part in parts if _is_long(part.cylinder))
+        return [piece for piece in pieces if piece is not None]
 
-    def _measured(self, candidate: Candidate, others: Sequence[Cylinder], trusted: bool) -> MeasuredPipe | None:
+    def measured(self, candidate: Candidate, others: Sequence[Cylinder], trusted: bool) -> MeasuredPipe | None:
         """The pipe that cloud and keyframes make of a candidate; None where they make none.
 
         A candidate whose contour is not seen stays as the cloud has it only where it is trusted and, beside keyframes
@@ -174,7 +187,9 @@ class KeyframeVerifier:
             # Where noise hides the section only the planned radii tell a thin pipe from the edge of a plate; where an
             # elbow is part of it they tell a stub.
             if fit is not None and self._fitter.is_planned(fit) and self._fitter.strays(candidate, fit):
-                fit = self._fitter.of_planned_radius(candidate, others, self._views) or fit
+                # Where the cloud has a planned radius any support of it suffices, as in `verify`.
+                least = MIN_SUPPORT if self._fitter.is_planned_in_cloud(candidate) else CONVINCING
+                fit = self._fitter.of_planned_radius(candidate, others, self._views, least) or fit
             else:
                 fit = self._fitter.near_planned(candidate, fit, others, self._views)
                 if fit is None or not self._fitter.is_planned(fit):
@@ -200,6 +215,18 @@ class KeyframeVerifier:
     def _shows_both_sides(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
         """Whether it has edges on each side that is not hidden: a board or a step has them on one."""
         return Scene.of(cylinder, self._views, others).support().weaker_share >= MIN_SUPPORT
+
+
+def _is_long(cylinder: Cylinder) -> bool:
+    """Whether a part of a pipe is long enough to be measured by itself."""
+    return cylinder.length > LEAST_STUB * cylinder.radius
+
+
+def _beyond(known: MeasuredPipe, within: Cylinder) -> list[Candidate]:
+    """The parts of a known pipe before and after the ends of a cylinder within it."""
+    low, high = sorted(known.cylinder.along(np.stack([within.start, within.end])).tolist())
+    parts = [known.part(*each) for each in ((0.0, low), (high, known.cylinder.length)) if each[0] < each[1]]
+    return [part for part in parts if _is_long(part.cylinder)]
 
 
 def _is_refuted(known: MeasuredPipe, within: MeasuredPipe) -> bool:

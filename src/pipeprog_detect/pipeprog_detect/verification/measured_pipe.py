@@ -17,6 +17,8 @@ from pipeprog_detect.silhouette.free_space import SHORTEST, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, PipeEnd, View
 from pipeprog_detect.verification.radius_agreement import agree
+from pipeprog_detect.verification.scene_context import SceneContext
+from pipeprog_detect.verification.walls_across import stretches_in_walls
 
 # What the cloud does not resolve is no pipe if it is shorter than this many radii: hangers and clamps are.
 SLENDER = 20.0
@@ -58,20 +60,31 @@ class MeasuredPipe:
         sigma = float(np.hypot(candidate.radius_sigma, candidate.evidence.noise))
         return cls(candidate, candidate.cylinder.cut_like(fit.cylinder), sigma)
 
+    def part(self, low: float, high: float) -> Candidate:
+        """The candidate for the part of it between two positions [m from its start]."""
+        points = int((high - low) / self.cylinder.length * self.candidate.points)
+        return replace(self.candidate, cylinder=self.cylinder.cut(low, high), points=points)
+
     @property
     def is_as_in_cloud(self) -> bool:
         """Whether the cloud resolves the section and has the radius of the contour."""
         return self.fit is not None and agree(self.candidate, self.fit)
 
 
-def joined(measured: Sequence[MeasuredPipe], views: Sequence[View], overlapping: bool = False) -> list[MeasuredPipe]:
+def joined(
+    measured: Sequence[MeasuredPipe],
+    views: Sequence[View],
+    overlapping: bool = False,
+    context: SceneContext | None = None,
+) -> list[MeasuredPipe]:
     """The pipes with collinear pieces joined; the radius is that of the piece with the least standard deviation.
 
-    Pieces of two radii are two pipes, and so are those between which the views see what is behind them. Only those that
-    lie within each other are joined where `overlapping` is asked for.
+    Pieces of two radii are two pipes, and so are those between which the views see what is behind them, or a wall of
+    the `context` closes around the axis. Only those that lie within each other are joined where `overlapping` is asked
+    for.
     """
     whole = []
-    for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views, overlapping):
+    for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views, overlapping, context):
         best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
         cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
         points = sum(measured[piece].candidate.points for piece in pieces)
@@ -86,7 +99,11 @@ def joined(measured: Sequence[MeasuredPipe], views: Sequence[View], overlapping:
 
 
 def _without_gaps(
-    groups: Sequence[Sequence[int]], measured: Sequence[MeasuredPipe], views: Sequence[View], overlapping: bool
+    groups: Sequence[Sequence[int]],
+    measured: Sequence[MeasuredPipe],
+    views: Sequence[View],
+    overlapping: bool,
+    context: SceneContext | None,
 ) -> list[list[int]]:
     """The groups of collinear pieces, parted where two neighbours on the axis are not one pipe."""
     parted = []
@@ -96,7 +113,7 @@ def _without_gaps(
         part = [ordered[0]]
         for piece in ordered[1:]:
             before, after = measured[part[-1]], measured[piece]
-            if (overlapping and not _overlap(before, after)) or not _continues(before, after, views):
+            if (overlapping and not _overlap(before, after)) or not _continues(before, after, views, context):
                 parted.append(part)
                 part = []
             part.append(piece)
@@ -104,8 +121,8 @@ def _without_gaps(
     return parted
 
 
-def _continues(one: MeasuredPipe, other: MeasuredPipe, views: Sequence[View]) -> bool:
-    """Whether two collinear pieces may be one pipe: of one radius, and nothing is seen through the gap between them."""
+def _continues(one: MeasuredPipe, other: MeasuredPipe, views: Sequence[View], context: SceneContext | None) -> bool:
+    """Whether two collinear pieces may be one pipe: of one radius, and there is no wall nor a free gap between them."""
     sigma = float(np.hypot(one.radius_sigma, other.radius_sigma))
     allowed = SAME_RADIUS * sigma + MANUFACTURE * one.cylinder.radius
     if abs(one.cylinder.radius - other.cylinder.radius) > allowed:
@@ -113,7 +130,10 @@ def _continues(one: MeasuredPipe, other: MeasuredPipe, views: Sequence[View]) ->
     ends = [(a, b) for a in (one.cylinder.start, one.cylinder.end) for b in (other.cylinder.start, other.cylinder.end)]
     start, end = min(ends, key=lambda pair: float(np.linalg.norm(pair[0] - pair[1])))
     gap = Cylinder(start, end, one.cylinder.radius)
-    return gap.length <= SHORTEST or not free_stretches(gap, views, [])
+    if gap.length <= SHORTEST:
+        return True
+    with_ends = gap.cut(-2.0 * gap.radius, gap.length + 2.0 * gap.radius)  # the pieces may end at the walls
+    return not (context and stretches_in_walls(with_ends, context, views, [])) and not free_stretches(gap, views, [])
 
 
 def _overlap(one: MeasuredPipe, other: MeasuredPipe) -> bool:

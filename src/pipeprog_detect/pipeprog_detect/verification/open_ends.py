@@ -20,7 +20,7 @@ from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from pipeprog_detect.verification.scene_context import SceneContext
-from pipeprog_detect.verification.wall_ends import MEETS
+from pipeprog_detect.verification.walls_across import MEETS
 
 # Distance [m] between the positions of the end that are weighed: the step of a free stretch.
 STEP = 0.01

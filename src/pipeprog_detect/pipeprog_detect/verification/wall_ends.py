@@ -8,8 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.cloud.cylinder_fit import basis
-from pipeprog_detect.cloud.octree import Octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.refinement.axial_evidence import axial_evidence
 from pipeprog_detect.silhouette.apparent_contour import views_showing
@@ -17,17 +15,8 @@ from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.scene_context import SceneContext
+from pipeprog_detect.verification.walls_across import LEAST_POINTS, MEETS, SAME_PLANE, points_on, surrounds
 
-# An axis meets a plane at more than 30 deg, or it runs along it.
-MEETS = 0.5
-# A plane exists at a position where at least this many of its points, nearer to it than the first distance [m], lie
-# within the second [m]: what hides a pipe's end hides the floor beside it, too.
-ON_PLANE, NEAR, LEAST_POINTS = 0.01, 0.5, 10
-# Planes that an axis meets within this distance [m] are one.
-SAME_PLANE = 0.05
-# A plane surrounds a pipe that passes it where its points lie in six of the eight sectors around the pipe, and no
-# farther than this from it [radii, m].
-SECTORS, CLOSED, CLOSE_RADII, CLOSE = 8, 6, 4.0, 0.05
 # Views that suffice to tell whether the pipe goes on.
 ENOUGH_VIEWS = 12
 
@@ -71,7 +60,7 @@ def planes_ahead(cylinder: Cylinder, at_end: bool, context: SceneContext, views:
     end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
     ahead: list[float] = []
     for plane in sorted(context.planes, key=lambda plane: -plane.area):
-        distance = _distance(end, out, cylinder, plane, context.walls, views)
+        distance = _distance(end, out, cylinder, plane, context, views)
         # Small planes are pieces of large ones, whose position they tell less precisely.
         if distance is not None and all(abs(distance - other) > SAME_PLANE for other in ahead):
             ahead.append(distance)
@@ -79,7 +68,7 @@ def planes_ahead(cylinder: Cylinder, at_end: bool, context: SceneContext, views:
 
 
 def _distance(
-    end: FloatArray, out: FloatArray, cylinder: Cylinder, plane: Plane, walls: Octree, views: Sequence[View]
+    end: FloatArray, out: FloatArray, cylinder: Cylinder, plane: Plane, context: SceneContext, views: Sequence[View]
 ) -> float | None:
     """How far [m] beyond the end, or before it, the axis meets the plane; None where that says nothing of the end."""
     slope = float(plane.normal @ out)
@@ -89,25 +78,15 @@ def _distance(
     # Half of the ends lie within ln 2 of the mean distance between them; of what a plane hides a radius is left.
     if not cylinder.radius - cylinder.length < distance < np.log(2.0) * cylinder.length:
         return None
-    place, thick = end + distance * out, ON_PLANE * plane.normal
-    offset = walls.points[walls.near_segment(place - thick, place + thick, NEAR)] - place
+    offset = points_on(plane.normal, end + distance * out, context)
     if len(offset) < LEAST_POINTS:
         return None
     if distance < 0.0:
         before = float(plane.normal @ out)
         seen_from = [before * float(plane.offset - plane.normal @ view.centre) for view in views]
-        if min(seen_from, default=0.0) <= 0.0 or not _closed(offset, out, cylinder.radius):
+        if min(seen_from, default=0.0) <= 0.0 or not surrounds(offset, out, cylinder.radius):
             return None
     return distance
-
-
-def _closed(offset: FloatArray, axis: FloatArray, radius: float) -> bool:
-    """Whether the points (N, 3), given from where the axis passes, lie close to the pipe on most of its sides."""
-    u, v = basis(axis)
-    x, y = offset @ u, offset @ v
-    close = np.hypot(x, y) < CLOSE_RADII * radius + CLOSE
-    sector = ((np.arctan2(y[close], x[close]) / (2.0 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
-    return len(np.unique(sector)) >= CLOSED
 
 
 def _goes_on(

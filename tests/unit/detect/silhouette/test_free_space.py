@@ -59,6 +59,15 @@ def test_nothing_is_free_along_a_whole_pipe(radius: float) -> None:
     assert free_stretches(line(radius), seen(tube(-HALF, HALF, radius)), []) == []
 
 
+def test_what_stands_before_a_gap_is_no_barrel() -> None:
+    """Two risers hide the gap from most views, in part; through what is left of it all see the wall."""
+    x, z = np.meshgrid(np.arange(-0.03, 0.03, 0.002), np.arange(-0.5, 0.5, 0.002))
+    risers = [np.stack([x + at, np.full_like(x, -0.3), z], axis=-1).reshape(-1, 3) for at in (-0.05, 0.06)]
+    radius = 0.1
+    [stretch] = free_stretches(line(radius), seen(tube(-HALF, -0.14, radius), tube(0.14, HALF, radius), *risers), [])
+    assert -0.14 - RESOLVED < stretch[0] - HALF < stretch[1] - HALF < 0.14 + RESOLVED
+
+
 def test_a_hidden_gap_is_not_told() -> None:
     column = Cylinder(np.array([0.0, -0.3, -1.0]), np.array([0.0, -0.3, 1.0]), 0.45)
     views = seen(tube(-HALF, -0.1, 0.03), tube(0.1, HALF, 0.03))

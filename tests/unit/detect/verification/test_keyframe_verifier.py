@@ -181,9 +181,30 @@ def test_of_two_pipes_in_one_place_the_edges_tell_which(
         fit = ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 2e-4, *told[cylinder.radius], 20, (0.0, 0.0), 0.0, 0.5)
         return MeasuredPipe.of_contour(candidate, fit)
 
-    monkeypatch.setattr(KeyframeVerifier, "_measured", measured)
+    monkeypatch.setattr(KeyframeVerifier, "measured", measured)
     monkeypatch.setattr(KeyframeVerifier, "_pieces", lambda self, whole, *_: [whole])
     evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
     candidates = [Candidate(PIPE, 2e-4, 500, evidence), Candidate(replace(PIPE, radius=0.09), 2e-4, 5000, evidence)]
     found = KeyframeVerifier(pipe_views, BOQ).measure(candidates, [True, True])
     assert [each.cylinder.radius for each in found] == [(0.09, PIPE.radius)[stands]]
+
+
+@pytest.mark.parametrize(("beyond", "radii"), [(0.0, [PIPE.radius]), (0.6, [PIPE.radius, 0.09])])
+def test_what_is_left_of_a_refuted_pipe_may_be_one_in_line(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, beyond: float, radii: list[float]
+) -> None:
+    """The cloud makes one of a pipe and a thicker one behind its end; `beyond` [m]: how far that goes on."""
+
+    def measured(self: KeyframeVerifier, candidate: Candidate, others: list[Cylinder], trusted: bool) -> MeasuredPipe:
+        cylinder, odds = candidate.cylinder, 100.0 if candidate.cylinder.radius == PIPE.radius else -30.0
+        fit = ContourFit(cylinder, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, odds, 20, (0.0, 0.0), 0.0, 0.5)
+        return MeasuredPipe.of_contour(candidate, fit if odds > 0.0 else replace(fit, support=0.5))
+
+    monkeypatch.setattr(KeyframeVerifier, "measured", measured)
+    monkeypatch.setattr(KeyframeVerifier, "_pieces", lambda self, whole, *_: [whole])
+    evidence = CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0)
+    both = replace(PIPE.cut(0.0, PIPE.length + beyond), radius=0.09)
+    candidates = [Candidate(both, 2e-4, 5000, evidence), Candidate(PIPE, 2e-4, 500, evidence)]
+    found = KeyframeVerifier(pipe_views, BOQ).measure(candidates, [True, True])
+    assert [each.cylinder.radius for each in found] == radii
+    assert [each.cylinder.length for each in found] == pytest.approx([PIPE.length, beyond][: len(radii)])
