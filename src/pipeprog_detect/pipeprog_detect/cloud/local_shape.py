@@ -245,7 +245,7 @@ def _neighbours(
 
     Returns the number of points, and of those that were copied.
     """
-    found = _copy_neighbours(points, ranges, site, scale, buffer, 1)
+    found = _copy_neighbours(points, ranges, site, scale, buffer, np.int64(1))
     if found <= len(buffer):
         return found, found
     step = -(-found // len(buffer))
@@ -284,7 +284,7 @@ def _fit_quadric(
     """
     frame = np.empty((3, 3))
     frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
-    q, rms, share, variance = _solve_quadric(near, site, frame, scale, sigma, 4)
+    q, rms, share, variance = _solve_quadric(near, site, frame, scale, sigma, np.int64(4))
     out[15] = rms
     out[16] = share
     if share == 0.0:
@@ -322,7 +322,7 @@ def _patch_residuals(points: FloatArray, first: IntArray, last: IntArray, scale:
         frame = np.empty((3, 3))
         frame[0], frame[1], frame[2] = axes[2], axes[1], axes[0]
         wide = max(spread[0], 1e-6)
-        _, rms, share, _ = _solve_quadric(near, mean, frame, scale, wide, 3)
+        _, rms, share, _ = _solve_quadric(near, mean, frame, scale, wide, np.int64(3))
         if share > _ONE_SURFACE:
             out[c] = rms * np.sqrt(len(near) / max(len(near) - 6.0, 1.0))
     return out

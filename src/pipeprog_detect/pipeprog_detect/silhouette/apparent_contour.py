@@ -86,7 +86,7 @@ def parts_by_view(samples: ContourSamples, views: int) -> Iterator[tuple[int, sl
 def project(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pixels (N, 2) and depths (N,) [m] of points (N, 3) of the map."""
     in_camera = points @ view.camera_from_map[:3, :3].T + view.camera_from_map[:3, 3]
-    depth = in_camera[:, 2]
+    depth = np.ascontiguousarray(in_camera[:, 2])
     safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
     camera = view.camera
     pixel = np.stack(
@@ -115,8 +115,9 @@ class ViewArrays:
     def of(cls, views: Sequence[View]) -> ViewArrays:
         """Those of the views, in their order."""
         rows = np.concatenate([view.geometry for view in views]).reshape(len(views), -1)
-        poses = np.ascontiguousarray(rows[:, :12]).reshape(-1, 3, 4)
-        return cls(poses, rows[:, 12:16], rows[:, 16:18], rows[:, 18:21])
+        # Contiguous: of one view slices are so anyway, and compiled code would be compiled for either.
+        poses, lenses, sizes, centres = (np.ascontiguousarray(part) for part in np.split(rows, [12, 16, 18], axis=1))
+        return cls(poses.reshape(-1, 3, 4), lenses, sizes, centres)
 
     def pixels_per_metre(self, point: FloatArray) -> FloatArray:
         """Width (V,) in the images [px] of one metre across the line of sight at a point (3,) of the map."""
@@ -171,7 +172,8 @@ def contour_samples(
     jacobian[:, 2:4] = (gain * share)[:, None] * columns[:, 5:7]
     jacobian[:, 4] = gain
     along = (share - 0.5) * cylinder.length
-    pixel, normal, half_width, depth = columns[:, 0:2], columns[:, 2:4], gain * cylinder.radius, columns[:, 7]
+    pixel, normal = np.ascontiguousarray(columns[:, 0:2]), np.ascontiguousarray(columns[:, 2:4])
+    half_width, depth = gain * cylinder.radius, np.ascontiguousarray(columns[:, 7])
     samples = ContourSamples(view, side, pixel, normal, along, gain, half_width, depth, jacobian)
     if all(each.rolled is None for each in views):
         return samples

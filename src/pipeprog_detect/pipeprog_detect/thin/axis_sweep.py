@@ -121,7 +121,7 @@ def _swept(stack: _Stack, radius: float) -> FloatArray:
 
     def lines_of(number: int) -> FloatArray:
         rows, columns = stack.size[number]
-        found = _lines(stack.edges[number, :rows, :columns], odds[number], int(2.0 * NARROWEST))
+        found = _lines(np.ascontiguousarray(stack.edges[number, :rows, :columns]), odds[number], int(2.0 * NARROWEST))
         return np.column_stack([np.full(len(found), number), found])
 
     def axes_of(lines: FloatArray) -> FloatArray:

@@ -223,9 +223,9 @@ def _projected_points(
 @njit(cache=True, nogil=True)
 def _along(
     pixel: NDArray[np.float32], depth: NDArray[np.float32], ends: FloatArray, length: float, reach: float
-) -> tuple[FloatArray, FloatArray, NDArray[np.float32]]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Of the pixels (M, 2) within `reach` of a segment (2, 2): place along it and aside [px], and depth [m] (N,)."""
-    place, aside, there = np.empty(len(pixel)), np.empty(len(pixel)), np.empty(len(pixel), np.float32)
+    place, aside, there = np.empty(len(pixel)), np.empty(len(pixel)), np.empty(len(pixel))
     ax, ay = (ends[1, 0] - ends[0, 0]) / length, (ends[1, 1] - ends[0, 1]) / length
     count = 0
     for i in range(len(pixel)):

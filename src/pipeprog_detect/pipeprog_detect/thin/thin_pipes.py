@@ -99,7 +99,7 @@ class _Search:
     @cached_property
     def some(self) -> NDArray[np.float32]:
         """Points of the cloud, as many as its depths need."""
-        return self.points[:: -(-len(self.points) // MOST_POINTS)]
+        return np.ascontiguousarray(self.points[:: -(-len(self.points) // MOST_POINTS)])
 
     def along_known_pipes(self, views: Sequence[View], swept: Sequence[View], again: Sequence[View] = ()) -> None:
         """Those along the directions of the known pipes that views show, of which the `swept` ones are looked through.
