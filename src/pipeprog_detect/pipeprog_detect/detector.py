@@ -187,7 +187,7 @@ def detect_outside(
     whole = joined(whole, judging, overlapping=True, context=around)
     whole = _judged(whole, judging, has_two_edges)
     ended = _abutted(with_grown_ends(whole, judging), around, judging)
-    standing = [each for each in ended if not is_hanger(each, prepared.points)]
+    standing = [each for each in ended if not is_hanger(each, prepared.points, around.planes)]
     return [each for each in standing if each.cylinder.length >= config.length_min]
 
 
