@@ -245,6 +245,7 @@ def _neighbours(
 
     Returns the number of points, and of those that were copied.
     """
+    # A plain constant has a type of its own, for which the function would be compiled once more; so have rounds below.
     found = _copy_neighbours(points, ranges, site, scale, buffer, np.int64(1))
     if found <= len(buffer):
         return found, found
