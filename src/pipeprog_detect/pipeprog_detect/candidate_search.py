@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -42,6 +42,9 @@ _THIN_SCALE, _UNBENT_SCALE = 2.0, 2.5
 # size h is known to 8 times the noise over h^2 and the root of its independent points: some 20, as the noise of stereo
 # is alike within a window. It counts as a bend from four standard deviations on: at h = 0.7 r those are 1 / r there.
 _LEAST_BENT = 14.6
+# Surfaces that are seen from twice the distance of most, or in a corner, are rougher than the cloud's noise tells: the
+# noise of stereo grows with the square of the distance.
+_ROUGHER = 4.0
 
 Report = Callable[[float, str], None]
 
@@ -78,8 +81,8 @@ class Search:
         The `known` ones are measured again, and others sought among the points (N,) that are `fresh`. A candidate that
         the scene rejects (a corner, a hollow) is dropped; one too rough for the cloud alone is put to the keyframes.
         One that they refuse is put to them again once its neighbours are known, which may hide a side of it. Last come
-        hypotheses to which no fit with a free radius led, at the planned radii near them, and planned pipes whose bend
-        the noise hides.
+        hypotheses to which no fit with a free radius led, at the planned radii near them, planned pipes whose bend
+        the noise hides, and those whose points are rougher than the others'.
         """
         free = np.ones(len(self.tree.points), bool)
         accepted: list[Candidate] = []
@@ -111,12 +114,14 @@ class Search:
                 if self._accepts_beside(candidate, [known.cylinder for known in accepted]):
                     accept(candidate)
             without_fit.sort(key=lambda each: -each.votes)
-            at_planned = (planned for hypothesis in without_fit for planned in self._at_planned_radii(hypothesis))
-            for planned in chain(at_planned, () if sections else self._unbent(fresh, free)):
-                if not any(_holds(known.cylinder, planned.cylinder) for known in accepted):
-                    held = fit_candidate(self.tree, free, planned, self.criteria.noise, hold_radius=True)
-                    if held is not None and self._accepts_beside(held, [each.cylinder for each in accepted]):
-                        accept(held)
+            self._hold(self._at_planned_radii(without_fit), free, accepted, accept)
+            if not sections:
+                self._hold(self._unbent(fresh, free), free, accepted, accept)
+                self.report(0.75, "looking for pipes in rougher surfaces")
+                criteria = replace(self.criteria, noise=_ROUGHER * self.criteria.noise)
+                rough = replace(self, criteria=criteria, report=lambda _share, _what: None)
+                bent = chain((Hypothesis(cylinder, 0) for cylinder in known), rough._bent(fresh, free))
+                rough._hold(self._at_planned_radii(bent), free, accepted, accept)
         self.report(0.8, "measuring")
         # Where the noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
         return [
@@ -124,6 +129,20 @@ class Search:
             for candidate in self._refitted(accepted)
             if self.verifier.has_views or not candidate.blurred or self._is_planned(candidate)
         ]
+
+    def _hold(
+        self,
+        hypotheses: Iterable[Hypothesis],
+        free: NDArray[np.bool_],
+        accepted: Sequence[Candidate],
+        accept: Callable[[Candidate], None],
+    ) -> None:
+        """Accept those that the keyframes verify beside the `accepted` ones, fitted at the radii of the hypotheses."""
+        for hypothesis in hypotheses:
+            if not any(_holds(known.cylinder, hypothesis.cylinder) for known in accepted):
+                held = fit_candidate(self.tree, free, hypothesis, self.criteria.noise, hold_radius=True)
+                if held is not None and self._accepts_beside(held, [each.cylinder for each in accepted]):
+                    accept(held)
 
     def _accepts(self, candidate: Candidate) -> bool:
         if self.around.rejects(candidate):
@@ -157,12 +176,14 @@ class Search:
         """Whether the noise may hide the bend of pipes of this radius [m]; thinner ones are always sought as lines."""
         return THICKEST_LINE < radius < _LEAST_BENT * _PROPOSED_ROUGHNESS * self.criteria.noise
 
-    def _at_planned_radii(self, hypothesis: Hypothesis) -> list[Hypothesis]:
-        """A hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""
-        cylinder = hypothesis.cylinder
-        near = [each for each in self.planned_radii if abs(each / cylinder.radius - 1.0) < HALF_STEP]
-        near.sort(key=lambda each: abs(each - cylinder.radius))
-        return [replace(hypothesis, cylinder=replace(cylinder, radius=each)) for each in near if each > THICKEST_LINE]
+    def _at_planned_radii(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
+        """Each hypothesis at the planned radii within half a step between sizes of its own, the nearest one first."""
+        for hypothesis in hypotheses:
+            cylinder = hypothesis.cylinder
+            near = [each for each in self.planned_radii if abs(each / cylinder.radius - 1.0) < HALF_STEP]
+            for radius in sorted(near, key=lambda each: abs(each - cylinder.radius)):
+                if radius > THICKEST_LINE:
+                    yield replace(hypothesis, cylinder=replace(cylinder, radius=radius))
 
     def _is_planned(self, candidate: Candidate) -> bool:
         """Whether its radius is within four standard deviations of a planned one."""
@@ -181,15 +202,19 @@ class Search:
         """Hypotheses of the fresh points that are free at that time: bent patches, fine to coarse, then lines."""
         if not fresh.any():
             return
+        yield from self._bent(fresh, free)
+        self.report(0.7, "looking for thin pipes")
+        thin = [planned for planned in self.planned_radii if planned < THICKEST_LINE] or [0.5 * THICKEST_LINE]
+        yield from self._lines(fresh, free, THICKEST_LINE, _THIN_SCALE, thin)
+
+    def _bent(self, fresh: NDArray[np.bool_], free: NDArray[np.bool_]) -> Iterator[Hypothesis]:
+        """Hypotheses of bent patches, fine to coarse, of the fresh points that are free then."""
         noise, (least, most) = self.criteria.noise, self.radius_range
         scales = [scale for scale in _PATCH_SCALES if scale < most and 2.0 * scale > least]
         for number, scale in enumerate(scales):
             self.report(0.2 + 0.5 * number / len(scales), f"looking for pipes in patches of {1e3 * scale:.0f} mm")
             patches = self._patches(free & fresh, scale, scale)
             yield from axis_voting.hypotheses_of(axis_voting.patch_votes(patches, noise, self.radius_range))
-        self.report(0.7, "looking for thin pipes")
-        thin = [planned for planned in self.planned_radii if planned < THICKEST_LINE] or [0.5 * THICKEST_LINE]
-        yield from self._lines(fresh, free, THICKEST_LINE, _THIN_SCALE, thin)
 
     def _unbent(self, fresh: NDArray[np.bool_], free: NDArray[np.bool_]) -> Iterator[Hypothesis]:
         """Hypotheses at the planned radii whose bend the noise hides, of the fresh points that are free then."""

@@ -80,3 +80,23 @@ def test_a_pipe_whose_bend_the_noise_hides_is_sought_as_a_line(pipe_views: list[
             assert candidate.cylinder.radius == PIPE.radius
             assert np.linalg.norm(candidate.cylinder.from_axis(PIPE.middle[None])) < noise
             assert candidate.cylinder.length == pytest.approx(PIPE.length, abs=noise)
+
+
+def test_a_pipe_whose_points_are_rougher_than_most_is_found(pipe_views: list[View], empty_views: list[View]) -> None:
+    noise = 5e-4
+    rng = np.random.default_rng(0)
+    angle, along = rng.uniform(-1.2, 1.2, 6000), rng.uniform(0.0, PIPE.length, 6000)
+    points = barrel_points(angle, along, PIPE.radius + rng.normal(0.0, 6.0 * noise, 6000))
+    for views, planned, count in (
+        (pipe_views, PIPE.radius, 1),
+        (pipe_views, 2.0 * PIPE.radius, 0),
+        (empty_views, PIPE.radius, 0),
+        ([], PIPE.radius, 0),
+    ):
+        search = search_in(points, noise, views, planned)
+        every = np.ones(len(search.tree.points), bool)
+        candidates = search.candidates(every, [], [])
+        assert [candidate.cylinder.radius for candidate in candidates] == [PIPE.radius] * count
+        # The next map has the same points, none of which is new.
+        again = search.candidates(~every, [candidate.cylinder for candidate in candidates], [])
+        assert len(again) == count
