@@ -18,8 +18,9 @@ from pipeprog_detect.types import Cylinder, View
 # Width of the strip of cloud beside a thin pipe that it is compared with, in its own widths.
 BESIDE_REACH = 4.0
 # Strip of cloud beside a thin pipe in which a face that it is the edge of must go on: beyond what half a stereo window
-# spreads of the pipe itself, in radii.
-FACE = (4.0, 8.0)
+# spreads of the pipe itself, in radii. And strips between that and its edge, which a face fills as well: between two
+# pipes there is a gap.
+FACE, UP_TO_FACE = (4.0, 8.0), ((2.0, 3.0), (3.0, 4.0))
 # Share of its length along which the cloud must show what is there and beside it, to tell whether a line is an edge:
 # more than clamps and crossing pipes take.
 SHOWN = 0.2
@@ -115,10 +116,11 @@ def is_edge_of_face(
 ) -> bool:
     """Whether a face whose edge it is goes on beside it: a tray's, a duct's or a board's.
 
-    Seen from the mean centre of the views, the cloud's points (N, 3) then lie as far away beside it, on one side, as
-    where it is, and on the other side farther away by its diameter at least. What the cloud shows there may be nearer
-    than it, since lines tell the depth of an edge badly, but not behind it. One of the `walls`, seen aslant, is farther
-    away on one side as well; it has no edge where it goes on. The barrels of the `others` are no faces.
+    Seen from the mean centre of the views, the cloud's points (N, 3) then lie as far away beside it, on one side and
+    without a gap, as where it is, and on the other side farther away by its diameter at least. What the cloud shows
+    there may be nearer than it, since lines tell the depth of an edge badly, but not behind it. One of the `walls`,
+    seen aslant, is farther away on one side as well; it has no edge where it goes on. The barrels of the `others` are
+    no faces.
     """
     centre = mean_centre(cylinder, views)
     if centre is None:
@@ -134,14 +136,19 @@ def is_edge_of_face(
         return by_bin(cell[there], values[there], bins, 50.0)
 
     on, beside = level(-0.6, 0.6), (level(-FACE[1], -FACE[0]), level(*FACE))
+    up_to_it = (
+        [level(-most, -least) for least, most in UP_TO_FACE],
+        [level(least, most) for least, most in UP_TO_FACE],
+    )
     shown = on - depth < 2.0 * radius
     for wall in walls:
         off = np.abs(points[rows] @ wall.normal.astype(np.float32) - np.float32(wall.offset))
         shown &= ~((level(-FACE[1], -FACE[0], off) < radius) & (level(*FACE, off) < radius))
-    flush, open_beside = (
-        [np.abs(each - on) < 2.0 * radius for each in beside],
-        [~(each - on < 2.0 * radius) for each in beside],
-    )
+    flush = [
+        np.all([np.abs(each - on) < 2.0 * radius for each in (face, *strips)], axis=0)
+        for face, strips in zip(beside, up_to_it, strict=True)
+    ]
+    open_beside = [~(each - on < 2.0 * radius) for each in beside]
     for face, flush_there, open_there in zip(beside, flush, reversed(open_beside), strict=True):
         told = shown & np.isfinite(face)
         if told.sum() > SHOWN * bins and (told & flush_there & open_there).sum() > 0.5 * told.sum():

@@ -93,13 +93,27 @@ def test_a_wall_that_is_seen_aslant_has_no_edge_behind_a_pipe(pipe_views: list[V
 
 
 def test_the_barrel_of_a_neighbour_is_no_face(pipe_views: list[View]) -> None:
-    """A thin pipe runs 57 mm beside a DN100 at the depth of its front, before nothing."""
+    """A thin pipe runs 11 mm beside a DN100, 33 mm before its axis, before nothing."""
     line = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
-    neighbour = Cylinder(np.array([-0.35, 0.04, -0.1]), np.array([0.35, 0.04, -0.1]), 0.0575)
+    neighbour = Cylinder(np.array([-0.35, 0.033, -0.07]), np.array([0.35, 0.033, -0.07]), 0.0575)
     on_line = front_points(line)[::4]
     points = np.concatenate([front_points(neighbour), on_line]).astype(np.float32)
     assert is_edge_of_face(line, points, pipe_views, [], [])
     assert not is_edge_of_face(line, points, pipe_views, [], [neighbour])
+
+
+@pytest.mark.parametrize("apart", [0.045, 0.06, 0.08])
+def test_the_other_one_of_two_pipes_is_no_face(apart: float, pipe_views: list[View]) -> None:
+    """Stereo spreads each by half its width; between them the cloud shows what is behind."""
+    line = Cylinder(np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.0, 0.0]), 0.0086)
+    rng = np.random.default_rng(3)
+    along, height = rng.uniform(-0.35, 0.35, 20000), rng.uniform(-0.1, 0.1, 20000)
+    is_pipe = np.minimum(np.abs(height), np.abs(height + apart)) < 1.5 * line.radius
+    deep = np.where(is_pipe, 0.0, 0.2) + rng.normal(0.0, 2e-3, len(height))
+    points = np.stack([along, deep, height], axis=1).astype(np.float32)
+    assert not is_edge_of_face(line, points, pipe_views, [], [])
+    plate = np.stack([along, np.where(height < line.radius, 0.0, deep), height], axis=1).astype(np.float32)
+    assert is_edge_of_face(line, plate, pipe_views, [], [])
 
 
 def test_mean_centre_is_of_the_views_that_show_a_pipe(pipe_views: list[View]) -> None:
