@@ -26,7 +26,7 @@ KNOWN_RADIUS, KNOWN_AXIS = 0.02, 0.5
 AXIS_RANGE, RADIUS_RANGE = (3.0, 2.0, 0.4), (2.5, 2.0, 0.3)
 # Standard deviation [m] of a radius that is fixed: less than a contour tells (0.1 mm).
 RADIUS_FIXED = 1e-5
-# The distance from the cameras is sought within two of its standard deviations.
+# The distance from the cameras, and the slope towards them, are sought within two of their standard deviations.
 DEPTH_RANGE = 2.0
 # Up to three results of the search, if their contours differ by this much [px rms], compete on sub-pixel edges with the
 # start.
@@ -42,6 +42,8 @@ class Start:
         radius_sigma: standard deviation of its radius [m]; that of its axis is taken as twice as large.
         radius_known: contours of other radii are not sought; a piece that is not extended keeps this one.
         radius_fixed: a known radius that the pipe's own edges do not change either.
+        radius_error: standard deviation [m] of what is wrong with every edge of it in these images: a known radius is
+            held the less, or it would push the pipe away to look as thin.
         depth_sigma: standard deviation of its distance from the cameras [m], where that is larger.
         slope_sigma: standard deviation of its slope towards the cameras [rad].
         ends_known: the cloud shows its surface between the ends.
@@ -56,6 +58,7 @@ class Start:
     ends_known: bool = False
     seen: SeenArc | None = None
     radius_fixed: bool = False
+    radius_error: float = 0.0
 
     def precision(self) -> FloatArray:
         """(5, 5) precision [1/m^2] of the step of `Scene.moved`; the radius is left to the contour."""
@@ -96,7 +99,7 @@ def refine(
     if any(view.blur is None for view in views):
         scene = replace(scene, blur=scene.moved(steps[0]).measured_blur())
     held = prior.copy()
-    held[4, 4] = 1.0 / (RADIUS_FIXED if start.radius_fixed else RADIUS_HELD) ** 2
+    held[4, 4] = 1.0 / ((RADIUS_FIXED if start.radius_fixed else RADIUS_HELD) ** 2 + start.radius_error**2)
     priors = [held] if start.radius_known else [prior]
     if start.radius_known and follow and not start.radius_fixed:
         priors.append(prior)  # the pipe's own edges, once found, tell the radius
@@ -127,7 +130,8 @@ def _first_steps(start: Start, scene: Scene, planned_radii: Sequence[float]) -> 
         seeds = np.zeros((len(near), 5))
         seeds[:, 4] = near
         profiles = scene.wide_profiles(samples, furthest)
-        steps = distinct(best_steps(samples, profiles, reach, seeds), samples, APART, CANDIDATES)
+        tilt = DEPTH_RANGE * start.slope_sigma * start.cylinder.length
+        steps = distinct(best_steps(samples, profiles, reach, seeds, tilt), samples, APART, CANDIDATES)
         # The start itself is nearer than what the search prefers where another edge lies beside the contour.
         return np.vstack([steps, np.zeros(5)]), start.precision()
     side = None if start.seen is None else only_visible_side(scene)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -28,7 +29,11 @@ CROWD, CELL = 16, 2.0
 
 
 def best_steps(
-    samples: ContourSamples, profiles: Profiles, reach: FloatArray, seeds: FloatArray | None = None
+    samples: ContourSamples,
+    profiles: Profiles,
+    reach: FloatArray,
+    seeds: FloatArray | None = None,
+    tilt: float = np.inf,
 ) -> FloatArray:
     """Steps (E, 5) of `Scene.moved` within +-`reach` (5,) [m] that most edges of all views support, best first.
 
@@ -36,11 +41,20 @@ def best_steps(
         samples: of the contour before the step; `MOST_SAMPLES` suffice.
         profiles: the light around them, as far as the steps move them.
         reach: range of each component of the step.
-        seeds: further steps (S, 5) that are tried.
+        seeds: further steps (S, 5) that are tried, none of which tilts.
+        tilt: by how much more than its start the end may move away from the cameras or towards them [m].
     """
     response = _responses(profiles, samples)
-    none = np.zeros((0, 5))
-    return _annealed(samples, response, profiles.offsets, reach, none if seeds is None else seeds)
+    tried = np.zeros((0, 5)) if seeds is None else seeds
+    if tilt >= reach[3]:
+        return _annealed(samples, response, profiles.offsets, reach, tried)
+    # The end moves with the start, and by the tilt beside: the search need not look where only one of them moves far.
+    jacobian = samples.jacobian.copy()
+    jacobian[:, 1] += jacobian[:, 3]
+    reach = np.array([*reach[:3], tilt, reach[4]])
+    steps = _annealed(replace(samples, jacobian=jacobian), response, profiles.offsets, reach, tried)
+    steps[:, 3] += steps[:, 1]
+    return steps
 
 
 def _responses(profiles: Profiles, samples: ContourSamples) -> NDArray[np.float32]:

@@ -77,8 +77,7 @@ class LineFitter:
         """The accepted fit of a proposal, at the depth at which the views show it.
 
         Views from one height leave its depth open: then it is sought with the radius held, since a thicker pipe farther
-        away looks the same, from where the cloud has it, too, and the most probable fit counts. Where edges are
-        displaced the width tells little: there the radius is left to them, too.
+        away looks the same, from where the cloud has it, too, and the most probable fit counts.
         """
         start, depth_sigma = proposal.cylinder, proposal.depth_sigma
         if depth_sigma <= DEPTH_SIGMA * start.radius:
@@ -86,11 +85,10 @@ class LineFitter:
         centre = mean_centre(start, self.views)
         at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, False)
         rough = [(start, min(depth_sigma, DEPTH_REACH))] + ([] if at_depth is None else [(at_depth, LINE_DEPTH_SIGMA)])
-        held = (True, False) if self.displaced else (True,)
+        error = self._radius_error(start)
         starts = [
-            Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=fixed)
+            Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True, radius_error=error)
             for each, sigma in rough
-            for fixed in held
         ]
         located = [self._refined(each, known) for each in starts]
         # The known direction is evidence once: the fit has drawn the axis from it as far as the views did.
@@ -116,10 +114,18 @@ class LineFitter:
         return next(good, None)
 
     def again(self, fit: ContourFit, known: Sequence[Cylinder]) -> ContourFit | None:
-        """The accepted fit, in these views, of a pipe that other images have measured."""
-        start = Start(fit.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA)
-        found = self._refined(start, known)
-        return found if found is not None and self._accepts(found, known, PARALLEL_CONVINCING) else None
+        """A fit in other images, with what these views tell of it; None where they tell that it is no planned pipe.
+
+        Both tell its radius, the more probable fit all else. Both sides must be seen here to tell that it is none: a
+        shadow's edge is taken for a side as well, but seldom all along.
+        """
+        here = self._refined(Start(fit.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA), known)
+        if here is None:
+            return fit
+        if self._accepts(here, known, PARALLEL_CONVINCING):
+            return _of_both(fit, here)
+        weaker = Scene.of(here.cylinder, self.views, known).own_support().weaker_share
+        return fit if self._has_planned_radius(here) or min(here.support, weaker) < CONVINCING else None
 
     def in_direction(self, start: Cylinder, known: Sequence[Cylinder]) -> list[ContourFit]:
         """The accepted fits of a whole pipe: in the direction of `start`, and, from there, near this direction."""
@@ -164,10 +170,14 @@ class LineFitter:
         fit = refine(start, self.views, known, self.radii, follow)
         if fit is None or not self.displaced:
             return fit
-        gain = float(np.median(ViewArrays.of(self.views).pixels_per_metre(fit.cylinder.middle)))
         covariance = fit.covariance.copy()
-        covariance[4, 4] += (self.displaced / gain) ** 2
+        covariance[4, 4] += self._radius_error(fit.cylinder) ** 2
         return replace(fit, covariance=covariance, radius_sigma=float(np.sqrt(covariance[4, 4])))
+
+    def _radius_error(self, cylinder: Cylinder) -> float:
+        """Standard deviation [m] of what the edges of these images are off, at the distance of a cylinder."""
+        gain = float(np.median(ViewArrays.of(self.views).pixels_per_metre(cylinder.middle)))
+        return self.displaced / gain
 
     def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], least: tuple[float, float]) -> bool:
         """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does.
@@ -179,14 +189,26 @@ class LineFitter:
         return (
             fit.support >= least[0]
             and fit.radius_sigma < VAGUEST * fit.cylinder.radius
-            and is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
-            and any(
-                abs(fit.cylinder.radius - planned) < np.hypot(REACH * fit.radius_sigma, MANUFACTURE * planned)
-                for planned in self.radii
-            )
+            and self._has_planned_radius(fit)
             and Scene.of(fit.cylinder, self.views, known).own_support().weaker_share >= least[1]
             and not fit.is_flat
         )
+
+    def _has_planned_radius(self, fit: ContourFit) -> bool:
+        return is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq) and any(
+            abs(fit.cylinder.radius - planned) < np.hypot(REACH * fit.radius_sigma, MANUFACTURE * planned)
+            for planned in self.radii
+        )
+
+
+def _of_both(one: ContourFit, other: ContourFit) -> ContourFit:
+    """The more probable of two fits of a pipe in two kinds of images, with the mean of their radii by their sigmas."""
+    weights = 1.0 / np.array([one.radius_sigma, other.radius_sigma]) ** 2
+    radius = float(np.average([one.cylinder.radius, other.cylinder.radius], weights=weights))
+    probable = max(one, other, key=lambda fit: fit.log_odds)
+    cylinder, sigma = replace(probable.cylinder, radius=radius), float(1.0 / np.sqrt(weights.sum()))
+    scale = np.diag([1.0, 1.0, 1.0, 1.0, sigma / probable.radius_sigma])
+    return replace(probable, cylinder=cylinder, covariance=scale @ probable.covariance @ scale, radius_sigma=sigma)
 
 
 def _keeps_depth(cylinder: Cylinder, expected: Sequence[tuple[Cylinder, float]], centre: FloatArray | None) -> bool:

@@ -104,7 +104,7 @@ class _Search:
     def along_known_pipes(self, views: Sequence[View], swept: Sequence[View], again: Sequence[View] = ()) -> None:
         """Those along the directions of the known pipes that views show, of which the `swept` ones are looked through.
 
-        What these are certain of is measured `again` in others: both tell its radius, the more probable fit all else.
+        What these are certain of is measured `again` in others.
         """
         lines = self._fitter(views, DISPLACED if again else 0.0)
         proposals = propose_parallel(swept, parallel_directions(self.known), self.radii, self.known)
@@ -113,8 +113,7 @@ class _Search:
             if not self._is_taken(parallel.cylinder, views):
                 fit = lines.along_known_pipes(parallel, self.known)
                 if fit is not None and again:
-                    other = self._fitter(again).again(fit, self.known)
-                    fit = fit if other is None else _of_both(fit, other)
+                    fit = self._fitter(again).again(fit, self.known)
                 self._consider(fit, views)
 
     def by_lines(self, views: Sequence[View], seen: Sequence[PairView]) -> None:
@@ -232,16 +231,6 @@ def is_shadow(cylinder: Cylinder, known: Sequence[Cylinder]) -> bool:
         and float(other.surface_distance(middle)[0]) < cylinder.radius - AXIS_SIGMA
         for other in known
     )
-
-
-def _of_both(one: ContourFit, other: ContourFit) -> ContourFit:
-    """The more probable of two fits of a pipe in two kinds of images, with the mean of their radii by their sigmas."""
-    weights = 1.0 / np.array([one.radius_sigma, other.radius_sigma]) ** 2
-    radius = float(np.average([one.cylinder.radius, other.cylinder.radius], weights=weights))
-    probable = max(one, other, key=lambda fit: fit.log_odds)
-    cylinder, sigma = replace(probable.cylinder, radius=radius), float(1.0 / np.sqrt(weights.sum()))
-    scale = np.diag([1.0, 1.0, 1.0, 1.0, sigma / probable.radius_sigma])
-    return replace(probable, cylinder=cylinder, covariance=scale @ probable.covariance @ scale, radius_sigma=sigma)
 
 
 def _as_candidate(fit: ContourFit, points: NDArray[np.floating]) -> Candidate:

@@ -12,6 +12,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_detect.refinement.contour_adjustment import LEAST_IN_VIEW, adjusted
 from pipeprog_detect.refinement.contour_refinement import Start, refine
+from pipeprog_detect.refinement.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene, frame
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -21,6 +22,8 @@ UP = np.array([0.0, 0.0, 1.0])
 RADIUS_TOLERANCE = 0.35e-3
 # [m] The axis is as good across the view; along it by distance over half the baseline worse, 1.2 m / 0.45 m.
 AXIS_TOLERANCE = 0.35e-3 * 1.2 / 0.45
+# [m] The search ends within a pixel of the contour; sub-pixel edges come after it.
+SEARCH_TOLERANCE = 3.5e-3 * 1.2 / 0.45
 
 
 def disturbed(random: np.random.Generator) -> Cylinder:
@@ -75,6 +78,27 @@ def test_a_catalogue_radius_does_not_pull(pipe_views: list[View]) -> None:
     assert free is not None
     assert seeded is not None
     assert seeded.cylinder.radius == pytest.approx(free.cylinder.radius, abs=2e-5)
+
+
+def test_edges_that_may_be_off_let_go_of_a_fixed_radius(pipe_views: list[View]) -> None:
+    wide = dataclasses.replace(PIPE, radius=PIPE.radius + 1e-3)
+    for error, radius in ((0.0, wide.radius), (2e-3, PIPE.radius)):
+        fit = refine(Start(wide, 1e-3, radius_known=True, radius_fixed=True, radius_error=error), pipe_views, [])
+        assert fit is not None
+        assert fit.cylinder.radius == pytest.approx(radius, abs=RADIUS_TOLERANCE)
+
+
+@pytest.mark.parametrize("tilt", [2e-3, np.inf])
+def test_the_search_tilts_no_more_than_the_slope_may(pipe_views: list[View], tilt: float) -> None:
+    away = frame(PIPE, np.array([0.0, 1.0, 0.0]))[1] * 0.05
+    scene = Scene.of(Cylinder(PIPE.start + away, PIPE.end + away, PIPE.radius), pipe_views, [])
+    samples = scene.samples(limit=MOST_SAMPLES)
+    reach = np.array([0.02, 0.1, 0.02, 0.1, 1e-3])
+    steps = best_steps(samples, scene.wide_profiles(samples, 30.0), reach, tilt=tilt)
+    assert (np.abs(steps[:, 3] - steps[:, 1]) <= tilt + 1e-12).all()
+    found = scene.moved(steps[0]).cylinder
+    for point in (found.start, found.end):
+        assert np.linalg.norm(PIPE.from_axis(point[None])) < SEARCH_TOLERANCE
 
 
 def test_same_input_same_result(pipe_views: list[View]) -> None:

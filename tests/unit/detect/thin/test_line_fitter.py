@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -11,6 +14,7 @@ from hypothesis import strategies as st
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.refinement.contour_refinement import Start
+from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.thin import line_fitter
 from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned
@@ -102,6 +106,20 @@ def test_a_fit_that_leaves_the_depth_that_was_expected_is_refused(
     assert found is (fit if stands else None)
 
 
+@pytest.mark.parametrize(("displaced", "expected"), [(0.0, 0.0), (0.5, 0.5)])
+def test_where_edges_are_displaced_the_radius_is_held_the_less(
+    displaced: float, expected: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Held to a hundredth of a millimetre, a pipe that looks thinner than it is was put far behind its place."""
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    started: list[Start] = []
+    monkeypatch.setattr(line_fitter, "refine", lambda start, *_: started.append(start))
+    lines = LineFitter(views, np.zeros((0, 3), np.float32), [0.0086], BillOfQuantities(()), displaced)
+    lines.along_known_pipes(Proposal(level(0.5), 0.1, 30.0), [])
+    gain = float(np.median([view.camera.fx / np.linalg.norm(view.centre) for view in views]))
+    assert [each.radius_error for each in started if each.radius_fixed] == [pytest.approx(expected / gain, rel=0.05)]
+
+
 @pytest.mark.parametrize(
     ("at_depth", "whole", "stands"),
     [(0.05, False, True), (0.12, False, False), (None, False, False), (0.05, True, False)],
@@ -155,3 +173,37 @@ def test_displaced_edges_make_the_radius_uncertain_everywhere(monkeypatch: pytes
     assert found.radius_sigma == pytest.approx(np.hypot(1e-4, 0.5 / gain), rel=0.02)
     assert np.sqrt(found.covariance[4, 4]) == pytest.approx(found.radius_sigma)
     assert found.covariance[:4, :4] == pytest.approx(1e-8 * np.eye(4))
+
+
+def fit_of(radius: float, sigma: float, odds: float) -> ContourFit:
+    cylinder = replace(level(1.0), radius=radius)
+    return ContourFit(cylinder, np.eye(3)[1:], sigma**2 * np.eye(5), sigma, 0.9, odds, 20, (0.0, 0.0), 0.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("radius", "weaker", "expected"),
+    [
+        (9e-3, 0.3, "both"),
+        (6e-3, 0.6, "none"),  # a rod: both of its sides are seen
+        (6e-3, 0.4, "one"),  # a shadow's edge for a side
+        (9e-3, 0.2, "one"),
+        (None, 0.0, "one"),
+    ],
+)
+def test_other_images_tell_the_radius_as_well(
+    radius: float | None, weaker: float, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
+    views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
+    one, here = fit_of(8e-3, 1e-4, 90.0), None if radius is None else fit_of(radius, 2e-4, 70.0)
+    monkeypatch.setattr(line_fitter, "refine", lambda *_: here)
+    monkeypatch.setattr(Scene, "own_support", lambda _: SimpleNamespace(weaker_share=weaker))
+    found = LineFitter(views, np.zeros((0, 3), np.float32), [0.0086], boq).again(one, [])
+    if expected != "both":
+        assert found is (one if expected == "one" else None)
+        return
+    assert found is not None
+    assert found.log_odds == 90.0
+    assert found.cylinder.radius == pytest.approx(8.2e-3)  # weights of 4 to 1
+    assert found.radius_sigma == pytest.approx(1e-4 * np.sqrt(0.8))
+    assert np.diag(found.covariance) == pytest.approx([1e-8, 1e-8, 1e-8, 1e-8, found.radius_sigma**2])

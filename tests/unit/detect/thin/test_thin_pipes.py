@@ -15,7 +15,7 @@ from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.thin.line_fitter import LineFitter
-from pipeprog_detect.thin.thin_pipes import _of_both, _Search, find_thin_pipes, is_shadow, turned_parallel
+from pipeprog_detect.thin.thin_pipes import _Search, find_thin_pipes, is_shadow, turned_parallel
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -100,22 +100,6 @@ def _raised(pose: FloatArray, by: float) -> FloatArray:
     raised: FloatArray = pose.copy()
     raised[:3, 3] -= pose[:3, :3] @ np.array([0.0, 0.0, by])
     return raised
-
-
-def test_both_kinds_of_images_tell_the_radius() -> None:
-    one, other = (
-        measured(replace(level(1.0), radius=radius), odds).fit for radius, odds in ((8e-3, 90.0), (9e-3, 70.0))
-    )
-    assert one is not None
-    assert other is not None
-    one, other = (
-        replace(fit, radius_sigma=sigma, covariance=sigma**2 * np.eye(5)) for fit, sigma in ((one, 1e-4), (other, 2e-4))
-    )
-    both = _of_both(one, other)
-    assert both.log_odds == 90.0
-    assert both.cylinder.radius == pytest.approx(8.2e-3)  # weights of 4 to 1
-    assert both.radius_sigma == pytest.approx(1e-4 * np.sqrt(0.8))
-    assert np.diag(both.covariance) == pytest.approx([1e-8, 1e-8, 1e-8, 1e-8, both.radius_sigma**2])
 
 
 def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour() -> None:
