@@ -56,7 +56,7 @@ def pair_views(
     points: NDArray[np.float32],
     radii: Sequence[float],
     known: Sequence[Cylinder],
-    edges: dict[tuple[int, int], FloatArray],
+    edges: dict[tuple[int, int, bool], FloatArray],
 ) -> list[PairView]:
     """Those of the views that tell more than the one before, each with the segment pairs that may be thin pipes.
 
@@ -66,7 +66,7 @@ def pair_views(
         radii: of thin pipes [m].
         known: pipes: between their outlines and before them no segment pairs are sought, since their highlights,
             shadows and seams look like thin pipes.
-        edges: straight edges that earlier calls found, by stamp and width; new ones are added.
+        edges: straight edges that earlier calls found, by stamp, width and whether in colour; new ones are added.
     """
     seen = mapped(lambda view: _pair_view(view, points, radii, known, edges), _apart(views, points))
     return [each for each in seen if each is not None]
@@ -115,16 +115,17 @@ def _pair_view(
     points: NDArray[np.float32],
     radii: Sequence[float],
     known: Sequence[Cylinder],
-    lines: dict[tuple[int, int], FloatArray],
+    lines: dict[tuple[int, int, bool], FloatArray],
 ) -> PairView | None:
     sized = _sized(view, points, radii)
     if sized is None:
         return None
+    is_coloured = view.image is view.chromaticity
     view, pixel, depth = sized
     near, middle, far = np.percentile(depth[:: max(len(depth) // ENOUGH_POINTS, 1)], [1, 50, 99])
     focal = view.camera.fx
     narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
-    key = (view.stamp, view.camera.width)
+    key = (view.stamp, view.camera.width, is_coloured)
     if key not in lines:
         lines[key] = straight_edges(view.image)
     found = segment_pairs(_at_the_stamp(lines[key], view, float(middle)), max(narrowest, 2.0), widest)

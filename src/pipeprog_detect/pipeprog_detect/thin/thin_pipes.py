@@ -49,7 +49,7 @@ def find_thin_pipes(
     found: Sequence[MeasuredPipe],
     views: Sequence[View],
     boq: BillOfQuantities,
-    edges: dict[tuple[int, int], FloatArray],
+    edges: dict[tuple[int, int, bool], FloatArray],
 ) -> list[MeasuredPipe]:
     """Pipes of radius up to `thickest` [m], beside those found, that the views show and the cloud hardly does.
 
@@ -63,7 +63,7 @@ def find_thin_pipes(
         found: the pipes of the cloud.
         views: the keyframes.
         boq: the bill of quantities.
-        edges: straight edges that earlier calls found, by stamp and width; new ones are added.
+        edges: straight edges that earlier calls found, as `pair_views` has them; new ones are added.
     """
     radii = [radius for radius in boq.radii if radius < thickest]
     if not views or not radii:
@@ -76,6 +76,8 @@ def find_thin_pipes(
     seen = pair_views(views, search.some, radii, search.known, edges)
     search.along_known_pipes(views, [each.view for each in seen])
     search.by_lines(views, seen)
+    if coloured:
+        search.by_lines(coloured, pair_views(coloured, search.some, radii, search.known, edges), again=views)
     return search.thin
 
 
@@ -111,18 +113,20 @@ class _Search:
         before_walls = [each for each in proposals if not self._is_no_pipe(each.cylinder, views)]
         for parallel in before_walls[:MOST_PROPOSED]:
             if not self._is_taken(parallel.cylinder, views):
-                fit = lines.along_known_pipes(parallel, self.known)
-                if fit is not None and again:
-                    fit = self._fitter(again).again(fit, self.known)
-                self._consider(fit, views)
+                self._consider(self._told(lines.along_known_pipes(parallel, self.known), again), views)
 
-    def by_lines(self, views: Sequence[View], seen: Sequence[PairView]) -> None:
-        """Those that segment pairs propose, in any direction."""
-        lines = self._fitter(views)
+    def by_lines(self, views: Sequence[View], seen: Sequence[PairView], again: Sequence[View] = ()) -> None:
+        """Those that segment pairs propose, in any direction; they are measured `again` as well."""
+        lines = self._fitter(views, DISPLACED if again else 0.0)
         for proposed in propose(seen, self.some, self.radii, MOST_PROPOSED):
             if not self._is_taken(proposed, views):
                 fit = lines.measure(proposed, self.known, follow=False)
-                self._consider(None if fit is None else lines.follow(fit, proposed.radius, self.known), views)
+                fit = None if fit is None else lines.follow(fit, proposed.radius, self.known)
+                self._consider(self._told(fit, again), views)
+
+    def _told(self, fit: ContourFit | None, again: Sequence[View]) -> ContourFit | None:
+        """The fit with what other images of it tell, if there are any."""
+        return fit if fit is None or not again else self._fitter(again).again(fit, self.known)
 
     def _fitter(self, views: Sequence[View], displaced: float = 0.0) -> LineFitter:
         return LineFitter(views, self.points, self.radii, self.boq, displaced)

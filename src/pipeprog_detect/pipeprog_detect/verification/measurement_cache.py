@@ -77,12 +77,13 @@ class MeasurementCache:
     """Contour fits of the last map; for one survey, whose keyframes keep their stamps and images.
 
     `novelty`: what the last map's cloud was like.
-    `edges`: straight edges (N, 2, 2) [px] by a keyframe's stamp and the width at which they were sought.
+    `edges`: straight edges (N, 2, 2) [px] by a keyframe's stamp, the width at which they were sought, and whether in
+    colour.
     """
 
     def __init__(self) -> None:
         self.novelty = MapChange()
-        self.edges: dict[tuple[int, int], FloatArray] = {}
+        self.edges: dict[tuple[int, int, bool], FloatArray] = {}
         self._last: list[tuple[Question, ContourFit | None]] = []
         self._current: list[tuple[Question, ContourFit | None]] = []
 

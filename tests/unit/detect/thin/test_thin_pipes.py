@@ -102,10 +102,11 @@ def _raised(pose: FloatArray, by: float) -> FloatArray:
     return raised
 
 
-def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour() -> None:
-    """Grey shows the wall as it is without the pipe."""
+@pytest.mark.parametrize("rise", [0.0, 0.4])
+def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour(rise: float) -> None:
+    """Grey shows the wall as it is without the pipe, which runs along known ones or, if it rises, along none."""
     copper = replace(CONCRETE, name="copper", colour=(0.75, 0.41, 0.12))
-    pipe = Cylinder(np.array([-0.45, -0.08, 0.02]), np.array([0.45, -0.08, 0.02]), 0.0086)
+    pipe = Cylinder(np.array([-0.45, -0.08, 0.02 - rise / 2]), np.array([0.45, -0.08, 0.02 + rise / 2]), 0.0086)
     grey = [replace(view, chromaticity=None) for view in walk_past([])]
     coloured = walk_past([cylinder(pipe.start, pipe.end, pipe.radius, copper)])
     views = [replace(view, chromaticity=other.chromaticity) for view, other in zip(grey, coloured, strict=True)]
