@@ -103,7 +103,9 @@ def is_bare(cylinder: Cylinder, points: NDArray[np.float32], centre: FloatArray)
 def is_one_step(scene: Scene) -> bool:
     """Whether the light steps on one side of the contour alone, of which the other side is hardly seen."""
     support = scene.support()
-    if support.weaker_share >= CONVINCING:
+    odds = float(support.log_odds().sum(axis=0).min())
+    # Of a short line in few views half of a side's edges are there by chance as well.
+    if support.weaker_share >= CONVINCING and odds > DECISIVE:
         return False
     samples = scene.samples()
     if not np.bincount(samples.side, minlength=2).all():
@@ -114,7 +116,6 @@ def is_one_step(scene: Scene) -> bool:
     texture = AS_TEXTURE * np.abs(_steps(scene, samples, BESIDE_EDGE)).sum(axis=0)[weaker]
     if steps.sum(axis=0).prod() < 0.0:
         return bool(size[weaker] < max(ONE_STAIR * size[stronger], texture))
-    odds = float(support.log_odds().sum(axis=0).min())
     least = UNSEEN_STEP if odds < -DECISIVE else ONE_STEP
     return bool(size[weaker] < max(least * size[stronger], texture) and odds < DECISIVE)
 

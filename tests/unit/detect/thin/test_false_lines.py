@@ -67,6 +67,18 @@ def test_a_step_that_the_edges_speak_against_is_the_textures(
     assert is_one_step(scene) is is_step
 
 
+@pytest.mark.parametrize(("share", "odds", "is_step"), [(0.55, 2.0, True), (0.55, 9.0, False), (0.45, 9.0, True)])
+def test_a_side_that_few_edges_support_may_be_texture(
+    share: float, odds: float, is_step: bool, empty_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A highlight: on one side the light steps by 24 grey levels, on the other by 2 in the other direction."""
+    line = Cylinder(np.array([SHADOW, WALL, -0.2]), np.array([SHADOW, WALL, 0.2]), 0.0086)
+    scene = Scene.of(line, empty_views, [])
+    monkeypatch.setattr(Scene, "support", lambda *_: Support(odds, share))
+    monkeypatch.setattr(Scene, "light", stepping(np.where(scene.samples().side == 0, 24.0, -2.0), 0.5))
+    assert is_one_step(scene) is is_step
+
+
 def stepping(inwards: FloatArray, texture: float) -> Callable[..., FloatArray]:
     """Stands for `Scene.light`: steps (N,) at the contour, one of texture beside it."""
 
@@ -113,13 +125,13 @@ def test_a_pipe_that_turns_from_darker_to_brighter_than_what_is_behind_it_has_tw
 
 @dataclass
 class Support:
-    """Stands for that of a contour of which no share of the second side is supported, with these log odds there."""
+    """Stands for that of a contour, with these log odds of the weaker side and the share of it that is supported."""
 
     odds: float
-    weaker_share = 0.0
+    weaker_share: float = 0.0
 
     def log_odds(self) -> np.ndarray:
-        return np.array([[0.0, self.odds]])
+        return np.array([[max(self.odds, 0.0), self.odds]])
 
 
 @pytest.mark.parametrize(("inside", "is_strip"), [(None, True), (60.0, False)])
