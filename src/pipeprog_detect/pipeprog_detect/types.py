@@ -52,6 +52,11 @@ class View:
         """The view with its colour in place of grey, how blurred is not known; None where it has no colour."""
         return None if self.chromaticity is None else replace(self, image=self.chromaticity, blur=None)
 
+    @property
+    def is_in_colour(self) -> bool:
+        """Whether it has its colour in place of grey."""
+        return self.image is self.chromaticity
+
     def shown(self, pixels: FloatArray, depths: FloatArray) -> FloatArray:
         """Where the image shows (N, 2) what lies at pixels (N, 2) at depths (N,) [m]."""
         return pixels if self.rolled is None else self.rolled.shown(pixels, depths)

@@ -120,12 +120,12 @@ def _pair_view(
     sized = _sized(view, points, radii)
     if sized is None:
         return None
-    is_coloured = view.image is view.chromaticity
+    is_in_colour = view.is_in_colour
     view, pixel, depth = sized
     near, middle, far = np.percentile(depth[:: max(len(depth) // ENOUGH_POINTS, 1)], [1, 50, 99])
     focal = view.camera.fx
     narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
-    key = (view.stamp, view.camera.width, is_coloured)
+    key = (view.stamp, view.camera.width, is_in_colour)
     if key not in lines:
         lines[key] = straight_edges(view.image)
     found = segment_pairs(_at_the_stamp(lines[key], view, float(middle)), max(narrowest, 2.0), widest)
