@@ -49,6 +49,42 @@ _ROUGHER = 4.0
 Report = Callable[[float, str], None]
 
 
+class _Taken:
+    """The candidates that were accepted, and the points that are nobody's yet.
+
+    Attributes:
+        candidates: in the order in which they were accepted.
+        free: which points of the tree (N,) lie near none of them; changed in place.
+    """
+
+    def __init__(self, tree: Octree) -> None:
+        self._tree = tree
+        self.candidates: list[Candidate] = []
+        self.free = np.ones(len(tree.points), bool)
+
+    @property
+    def cylinders(self) -> list[Cylinder]:
+        """Those of the candidates."""
+        return [each.cylinder for each in self.candidates]
+
+    def add(self, candidate: Candidate) -> None:
+        """Takes a candidate with the points near it."""
+        self.candidates.append(candidate)
+        cylinder = candidate.cylinder
+        reach = cylinder.radius + 3.0 * candidate.band
+        self.free[self._tree.near_segment(cylinder.start, cylinder.end, reach)] = False
+
+    def holds(self, cylinder: Cylinder) -> bool:
+        """Whether the cylinder's middle lies within one that is taken, or no more than its radius before its ends."""
+        middle = cylinder.middle[None]
+        for known in self.cylinders:
+            along = float(known.along(middle)[0])
+            off = float(np.linalg.norm(known.from_axis(middle)))
+            if off < known.radius and -known.radius < along < known.length + known.radius:
+                return True
+        return False
+
+
 @dataclass(frozen=True)
 class Search:
     """Where pipes are sought, which, and by what they are judged.
@@ -84,65 +120,47 @@ class Search:
         hypotheses to which no fit with a free radius led, at the planned radii near them, planned pipes whose bend
         the noise hides, and those whose points are rougher than the others'.
         """
-        free = np.ones(len(self.tree.points), bool)
-        accepted: list[Candidate] = []
+        taken = _Taken(self.tree)
         refused: list[Candidate] = []
         without_fit: list[Hypothesis] = []
-
-        def accept(candidate: Candidate) -> None:
-            accepted.append(candidate)
-            cylinder = candidate.cylinder
-            reach = cylinder.radius + 3.0 * candidate.band
-            free[self.tree.near_segment(cylinder.start, cylinder.end, reach)] = False
-
-        def consider(hypothesis: Hypothesis) -> None:
-            candidate = fit_candidate(self.tree, free, hypothesis, self.criteria.noise)
+        sections = self.config.front_end == "planes"
+        proposed = self._sections(taken.free, planes) if sections else self._voted(fresh, taken.free)
+        again = [Hypothesis(cylinder, 0) for cylinder in known]
+        for hypothesis in chain(again, proposed):
+            candidate = fit_candidate(self.tree, taken.free, hypothesis, self.criteria.noise)
             if candidate is None:
                 without_fit.append(hypothesis)
             elif self._accepts(candidate):
-                accept(candidate)
+                taken.add(candidate)
             else:
                 refused.append(candidate)
-
-        for cylinder in known:
-            consider(Hypothesis(cylinder, 0))
-        sections = self.config.front_end == "planes"
-        for hypothesis in self._sections(free, planes) if sections else self._voted(fresh, free):
-            consider(hypothesis)
         if self.verifier.has_views:
             for candidate in refused:
-                if self._accepts_beside(candidate, [known.cylinder for known in accepted]):
-                    accept(candidate)
+                if self._accepts_beside(candidate, taken):
+                    taken.add(candidate)
             without_fit.sort(key=lambda each: -each.votes)
-            self._hold(self._at_planned_radii(without_fit), free, accepted, accept)
+            self._hold(self._at_planned_radii(without_fit), taken)
             if not sections:
-                self._hold(self._unbent(fresh, free), free, accepted, accept)
+                self._hold(self._unbent(fresh, taken.free), taken)
                 self.report(0.75, "looking for pipes in rougher surfaces")
                 criteria = replace(self.criteria, noise=_ROUGHER * self.criteria.noise)
                 rough = replace(self, criteria=criteria, report=lambda _share, _what: None)
-                bent = chain((Hypothesis(cylinder, 0) for cylinder in known), rough._bent(fresh, free))
-                rough._hold(self._at_planned_radii(bent), free, accepted, accept)
+                rough._hold(self._at_planned_radii(chain(again, rough._bent(fresh, taken.free))), taken)
         self.report(0.8, "measuring")
         # Where the noise hides the section only the planned radii tell a thin pipe from the edge of a plate.
         return [
             candidate
-            for candidate in self._refitted(accepted)
+            for candidate in self._refitted(taken.candidates)
             if self.verifier.has_views or not candidate.blurred or self._is_planned(candidate)
         ]
 
-    def _hold(
-        self,
-        hypotheses: Iterable[Hypothesis],
-        free: NDArray[np.bool_],
-        accepted: Sequence[Candidate],
-        accept: Callable[[Candidate], None],
-    ) -> None:
-        """Accept those that the keyframes verify beside the `accepted` ones, fitted at the radii of the hypotheses."""
+    def _hold(self, hypotheses: Iterable[Hypothesis], taken: _Taken) -> None:
+        """Take those that the keyframes verify beside what is taken, fitted at the radii of the hypotheses."""
         for hypothesis in hypotheses:
-            if not any(_holds(known.cylinder, hypothesis.cylinder) for known in accepted):
-                held = fit_candidate(self.tree, free, hypothesis, self.criteria.noise, hold_radius=True)
-                if held is not None and self._accepts_beside(held, [each.cylinder for each in accepted]):
-                    accept(held)
+            if not taken.holds(hypothesis.cylinder):
+                held = fit_candidate(self.tree, taken.free, hypothesis, self.criteria.noise, hold_radius=True)
+                if held is not None and self._accepts_beside(held, taken):
+                    taken.add(held)
 
     def _accepts(self, candidate: Candidate) -> bool:
         if self.around.rejects(candidate):
@@ -156,21 +174,21 @@ class Search:
         is_piece = proposed.of_piece().accept(candidate) or proposed.of_short_piece().accept(candidate)
         return is_piece and self.verifier.verify(candidate, least)
 
-    def _accepts_beside(self, candidate: Candidate, known: Sequence[Cylinder]) -> bool:
-        """Whether the known cylinders leave enough of a candidate visible that the keyframes make a pipe of it.
+    def _accepts_beside(self, candidate: Candidate, taken: _Taken) -> bool:
+        """Whether what is taken leaves enough of a candidate visible that the keyframes make a pipe of it.
 
         One whose bend the noise hides must be visible on both sides.
         """
         proposed = self.criteria.relaxed(_PROPOSED_ROUGHNESS)
         if (
             not (proposed.of_held_radius() if candidate.radius_held else proposed).accept(candidate)
-            or any(_holds(each, candidate.cylinder) for each in known)
+            or taken.holds(candidate.cylinder)
             or self.around.rejects(candidate)
         ):
             return False
         if candidate.radius_held and self._is_unbent(candidate.cylinder.radius):
             return self.verifier.verify(candidate)
-        return self.verifier.verify_beside(candidate, known)
+        return self.verifier.verify_beside(candidate, taken.cylinders)
 
     def _is_unbent(self, radius: float) -> bool:
         """Whether the noise may hide the bend of pipes of this radius [m]; thinner ones are always sought as lines."""
@@ -275,11 +293,3 @@ class Search:
             return candidate
         # Where there are keyframes, they will measure it.
         return replace(accepted[best], cylinder=cylinder) if self.verifier.has_views else None
-
-
-def _holds(known: Cylinder, other: Cylinder) -> bool:
-    """Whether the middle of the other cylinder lies within a known one, or no more than its radius before its ends."""
-    middle = other.middle[None]
-    along = float(known.along(middle)[0])
-    off = float(np.linalg.norm(known.from_axis(middle)))
-    return off < known.radius and -known.radius < along < known.length + known.radius
