@@ -27,7 +27,7 @@ RIM = 0.25
 # Prior of the model's slopes and shading, in steps between its two levels: standard deviation of what the model leaves
 # unexplained, and of a coefficient, which is some steps at the most (a slope, over 4 px). On a thin pipe the curves of
 # the shading are nearly one: free coefficients of ten steps and more cancel each other and move the edge by up to a
-# pixel. There the window holds about a third of the shading.
+# pixel. There a coefficient is held to a third of a step.
 UNEXPLAINED, SHADING, THIN_SHADING = 0.05, 1.5, 0.3
 # Thin is a pipe of which the window holds less than this [px]. Within twice as much a blurred edge and the shading are
 # told apart: held as tightly there, the dark side of a DN65, which ends in its own shadow without a step, was taken

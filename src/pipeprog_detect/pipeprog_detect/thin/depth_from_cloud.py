@@ -131,28 +131,24 @@ def is_edge_of_face(
     own = own[~_are_on(others, points[rows[own]], radius)]
     cell, aside, far, rows = cell[own], aside[own], far[own], rows[own]
 
-    def level(least: float, most: float, values: NDArray[np.floating] = far) -> FloatArray:
-        there = (aside > least * radius) & (aside < most * radius)
+    def level(strip: tuple[float, float], side: float, values: NDArray[np.floating] = far) -> FloatArray:
+        there = (side * aside > strip[0] * radius) & (side * aside < strip[1] * radius)
         return by_bin(cell[there], values[there], bins, 50.0)
 
-    on, beside = level(-0.6, 0.6), (level(-FACE[1], -FACE[0]), level(*FACE))
-    up_to_it = (
-        [level(-most, -least) for least, most in UP_TO_FACE],
-        [level(least, most) for least, most in UP_TO_FACE],
-    )
+    on = level((-0.6, 0.6), 1.0)
+    beside = {side: level(FACE, side) for side in (-1.0, 1.0)}
     shown = on - depth < 2.0 * radius
     for wall in walls:
         off = np.abs(points[rows] @ wall.normal.astype(np.float32) - np.float32(wall.offset))
-        shown &= ~((level(-FACE[1], -FACE[0], off) < radius) & (level(*FACE, off) < radius))
-    flush = [
-        np.all([np.abs(each - on) < 2.0 * radius for each in (face, *strips)], axis=0)
-        for face, strips in zip(beside, up_to_it, strict=True)
-    ]
-    open_beside = [~(each - on < 2.0 * radius) for each in beside]
-    for face, flush_there, open_there in zip(beside, flush, reversed(open_beside), strict=True):
+        shown &= ~np.all([level(FACE, side, off) < radius for side in beside], axis=0)
+    for side, face in beside.items():
         told = shown & np.isfinite(face)
-        if told.sum() > SHOWN * bins and (told & flush_there & open_there).sum() > 0.5 * told.sum():
-            return True
+        if told.sum() > SHOWN * bins:
+            strips = [face, *(level(strip, side) for strip in UP_TO_FACE)]
+            flush = np.all([np.abs(strip - on) < 2.0 * radius for strip in strips], axis=0)
+            farther = ~(beside[-side] - on < 2.0 * radius)
+            if (told & flush & farther).sum() > 0.5 * told.sum():
+                return True
     return False
 
 
