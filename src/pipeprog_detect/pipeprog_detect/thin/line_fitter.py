@@ -116,10 +116,11 @@ class LineFitter:
     def again(self, fit: ContourFit, known: Sequence[Cylinder]) -> ContourFit | None:
         """A fit in other images, with what these views tell of it; None where they tell that it is no planned pipe.
 
-        Both tell its radius, the more probable fit all else. Both sides must be seen here to tell that it is none: a
-        shadow's edge is taken for a side as well, but seldom all along.
+        Both tell its axis and radius, the more probable fit how long it is. Both sides must be seen here to tell that
+        it is none: a shadow's edge is taken for a side as well, but seldom all along.
         """
-        here = self._refined(Start(fit.cylinder, HELD_AXIS, True, 0.0, PARALLEL_SIGMA), known)
+        deep, slope = np.sqrt(np.diag(fit.covariance)[[1, 3]]).tolist()  # away from the views
+        here = self._refined(Start(fit.cylinder, HELD_AXIS, True, deep, slope), known)
         if here is None:
             return fit
         if self._accepts(here, known, PARALLEL_CONVINCING):
@@ -166,12 +167,18 @@ class LineFitter:
         return fit if fit is not None and self._accepts(fit, known, LINES_CONVINCING) else None
 
     def _refined(self, start: Start, known: Sequence[Cylinder], follow: bool = True) -> ContourFit | None:
-        """`refine`, with what the edges of these images are off in the standard deviation of the radius."""
+        """`refine`, with what the edges of these images are off in the standard deviations of radius and depth.
+
+        Where they are off otherwise from above than from below, the depth is by that over the spread of the sights.
+        """
         fit = refine(start, self.views, known, self.radii, follow)
         if fit is None or not self.displaced:
             return fit
+        error = self._radius_error(fit.cylinder)
+        spread = max(_spread_of_sights(fit.cylinder, self.views), error / LINE_DEPTH_SIGMA)
         covariance = fit.covariance.copy()
-        covariance[4, 4] += self._radius_error(fit.cylinder) ** 2
+        covariance[1, 1] += (error / spread) ** 2
+        covariance[4, 4] += error**2
         return replace(fit, covariance=covariance, radius_sigma=float(np.sqrt(covariance[4, 4])))
 
     def _radius_error(self, cylinder: Cylinder) -> float:
@@ -201,14 +208,31 @@ class LineFitter:
         )
 
 
-def _of_both(one: ContourFit, other: ContourFit) -> ContourFit:
-    """The more probable of two fits of a pipe in two kinds of images, with the mean of their radii by their sigmas."""
-    weights = 1.0 / np.array([one.radius_sigma, other.radius_sigma]) ** 2
-    radius = float(np.average([one.cylinder.radius, other.cylinder.radius], weights=weights))
-    probable = max(one, other, key=lambda fit: fit.log_odds)
-    cylinder, sigma = replace(probable.cylinder, radius=radius), float(1.0 / np.sqrt(weights.sum()))
-    scale = np.diag([1.0, 1.0, 1.0, 1.0, sigma / probable.radius_sigma])
-    return replace(probable, cylinder=cylinder, covariance=scale @ probable.covariance @ scale, radius_sigma=sigma)
+def _spread_of_sights(cylinder: Cylinder, views: Sequence[View]) -> float:
+    """Standard deviation [rad] of the directions, around its axis, from which the views look at a cylinder.
+
+    Of all views where none shows its middle, as `viewing_direction` has it.
+    """
+    arrays = ViewArrays.of(views)
+    showing = arrays.showing(cylinder.middle[None])
+    away = cylinder.from_axis(arrays.centres[showing] if showing.any() else arrays.centres)
+    sideways = away @ _sideways(cylinder, views)
+    return float(np.std(sideways / np.linalg.norm(away, axis=1)))
+
+
+def _of_both(earlier: ContourFit, here: ContourFit) -> ContourFit:
+    """The more probable of two fits of a pipe, on the axis of the one `here`, which began with the `earlier` one.
+
+    Its radius is the mean of theirs by their sigmas.
+    """
+    weights = 1.0 / np.array([earlier.radius_sigma, here.radius_sigma]) ** 2
+    radius = float(np.average([earlier.cylinder.radius, here.cylinder.radius], weights=weights))
+    probable = max(earlier, here, key=lambda fit: fit.log_odds)
+    cylinder = replace(here.cylinder.cut_like(probable.cylinder), radius=radius)
+    sigma = float(1.0 / np.sqrt(weights.sum()))
+    scale = np.diag([1.0, 1.0, 1.0, 1.0, sigma / here.radius_sigma])
+    covariance = scale @ here.covariance @ scale
+    return replace(probable, cylinder=cylinder, across=here.across, covariance=covariance, radius_sigma=sigma)
 
 
 def _keeps_depth(cylinder: Cylinder, expected: Sequence[tuple[Cylinder, float]], centre: FloatArray | None) -> bool:

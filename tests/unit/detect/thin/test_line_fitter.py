@@ -11,13 +11,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.refinement.contour_refinement import Start
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.thin import line_fitter
 from pipeprog_detect.thin.axis_sweep import Proposal
-from pipeprog_detect.thin.line_fitter import LineFitter, aligned, turned
+from pipeprog_detect.thin.line_fitter import LINE_DEPTH_SIGMA, LineFitter, aligned, turned
 from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -160,10 +161,13 @@ def test_of_a_proposal_that_goes_on_beyond_the_pipe_the_pipe_counts(
     assert lines.along_known_pipes(Proposal(longer, 2e-3, 50.0), []) is whole
 
 
-def test_displaced_edges_make_the_radius_uncertain_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the fit's covariance as well: what observes the pipe later updates that."""
+def test_displaced_edges_make_radius_and_depth_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the fit's covariance as well: what observes the pipe later updates that.
+
+    From one height the depth is as uncertain as it is before anything is measured, from two by what they differ in.
+    """
     views: list[View] = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
-    across = np.eye(3)[1:]
+    across = np.eye(3)[[2, 1]]
     fit = ContourFit(level(1.0), across, 1e-8 * np.eye(5), 1e-4, 0.9, 50.0, 20, (0.0, 0.0), 0.0, 0.1)
     monkeypatch.setattr(line_fitter, "refine", lambda *_: fit)
     lines = LineFitter(views, np.zeros((0, 3), np.float32), [0.0086], BillOfQuantities(()), displaced=0.5)
@@ -172,7 +176,21 @@ def test_displaced_edges_make_the_radius_uncertain_everywhere(monkeypatch: pytes
     gain = float(np.median([view.camera.fx / np.linalg.norm(view.centre) for view in views]))
     assert found.radius_sigma == pytest.approx(np.hypot(1e-4, 0.5 / gain), rel=0.02)
     assert np.sqrt(found.covariance[4, 4]) == pytest.approx(found.radius_sigma)
-    assert found.covariance[:4, :4] == pytest.approx(1e-8 * np.eye(4))
+    deep = np.diag([0.0, LINE_DEPTH_SIGMA**2, 0.0, 0.0])
+    assert found.covariance[:4, :4] == pytest.approx(1e-8 * np.eye(4) + deep)
+    higher = [replace(view, camera_from_map=_raised(view.camera_from_map, 0.4)) for view in views]
+    found = replace(lines, views=views + higher)._refined(Start(level(1.0), 0.0086), [])
+    assert found is not None
+    distance = float(np.mean([np.linalg.norm(level(1.0).from_axis(view.centre[None])) for view in views + higher]))
+    error = np.sqrt(found.covariance[4, 4] - 1e-8)
+    assert np.sqrt(found.covariance[1, 1] - 1e-8) == pytest.approx(error / (0.5 * 0.4 / distance), rel=0.05)
+
+
+def _raised(camera_from_map: FloatArray, by: float) -> FloatArray:
+    """The pose of a camera that stands higher [m]."""
+    pose = camera_from_map.copy()
+    pose[:3, 3] -= pose[:3, 2] * by
+    return pose
 
 
 def fit_of(radius: float, sigma: float, odds: float) -> ContourFit:
@@ -190,13 +208,22 @@ def fit_of(radius: float, sigma: float, odds: float) -> ContourFit:
         (None, 0.0, "one"),
     ],
 )
-def test_other_images_tell_the_radius_as_well(
+def test_other_images_tell_axis_and_radius_as_well(
     radius: float | None, weaker: float, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """They begin with the axis as well as it is known; the more probable fit tells how long the pipe is."""
     boq = BillOfQuantities((PipeClass("copper 17", 0.0086, 10.0, (1.0, 0.0, 1.0), 4e-4),))
     views = [looking_along_y(x, number) for number, x in enumerate((-0.3, 0.0, 0.3))]
     one, here = fit_of(8e-3, 1e-4, 90.0), None if radius is None else fit_of(radius, 2e-4, 70.0)
-    monkeypatch.setattr(line_fitter, "refine", lambda *_: here)
+    if here is not None:
+        here = replace(here, cylinder=here.cylinder.cut(0.1, 0.9).shifted(np.array([0.0, 5e-3, 0.0])))
+    starts: list[Start] = []
+
+    def refined(start: Start, *_: object) -> ContourFit | None:
+        starts.append(start)
+        return here
+
+    monkeypatch.setattr(line_fitter, "refine", refined)
     monkeypatch.setattr(Scene, "own_support", lambda _: SimpleNamespace(weaker_share=weaker))
     found = LineFitter(views, np.zeros((0, 3), np.float32), [0.0086], boq).again(one, [])
     if expected != "both":
@@ -206,4 +233,8 @@ def test_other_images_tell_the_radius_as_well(
     assert found.log_odds == 90.0
     assert found.cylinder.radius == pytest.approx(8.2e-3)  # weights of 4 to 1
     assert found.radius_sigma == pytest.approx(1e-4 * np.sqrt(0.8))
-    assert np.diag(found.covariance) == pytest.approx([1e-8, 1e-8, 1e-8, 1e-8, found.radius_sigma**2])
+    assert np.diag(found.covariance) == pytest.approx([4e-8, 4e-8, 4e-8, 4e-8, found.radius_sigma**2])
+    assert (starts[0].depth_sigma, starts[0].slope_sigma) == pytest.approx((1e-4, 1e-4))
+    assert here is not None
+    assert np.linalg.norm(here.cylinder.from_axis(np.stack([found.cylinder.start, found.cylinder.end]))) < 1e-9
+    assert found.cylinder.length == pytest.approx(one.cylinder.length)
