@@ -192,12 +192,16 @@ def _further(evidence: AxialEvidence, clamp: float) -> float:
     if len(along) < 2:
         return 0.0
     step = float(along[1] - along[0])
-    total = most = last = bare = shown = 0.0
+    total = most = last = bare = shown = against = lacking = 0.0
     for here, odds, samples in zip(along.tolist(), log_odds.tolist(), seen.tolist(), strict=True):
         total += odds
         bare = bare + step if samples and odds < 0 else 0.0 if odds > 0 else bare
         shown += step if odds > 0 else 0.0
-        if bare > clamp + 2.0 * step or here - last > HIDDEN + shown:
+        # One edge that happens to lie in a gap does not close it: evidence for the pipe must outweigh that against it.
+        against = min(against + odds, 0.0)
+        lacking = 0.0 if against == 0.0 else lacking + step if samples else lacking
+        is_gap = lacking > clamp + 2.0 * step and against < -CERTAIN
+        if is_gap or bare > clamp + 2.0 * step or here - last > HIDDEN + shown:
             break
         if total > most + (CERTAIN if last == 0.0 or here - last > clamp else 0.0):
             most, last = total, here + 0.5 * step

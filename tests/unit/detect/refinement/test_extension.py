@@ -10,7 +10,14 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_detect.refinement import extension
-from pipeprog_detect.refinement.axial_evidence import BRIGHTER, DARKER, NO_EDGE, _log_odds, axial_evidence
+from pipeprog_detect.refinement.axial_evidence import (
+    BRIGHTER,
+    DARKER,
+    NO_EDGE,
+    AxialEvidence,
+    _log_odds,
+    axial_evidence,
+)
 from pipeprog_detect.refinement.contour_adjustment import adjusted
 from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.refinement.extension import extended, without_bend
@@ -89,6 +96,19 @@ def test_a_pipe_without_holes_does_not_grow_where_the_views_see_through(pipe_vie
     whole = with_depths(pipe_views, np.concatenate([wall_points(), front_points(PIPE)]))
     assert extended(Scene.of(known, whole, [])).length > 0.37
     assert 0.28 <= extended(Scene.of(known, views, [])).length < 0.32 + PIPE.radius
+
+
+@pytest.mark.parametrize(
+    ("gap", "by_chance", "goes_on"),
+    [(0.06, 0.0, True), (0.16, 0.0, False), (0.16, 0.5, False), (0.16, 12.0, True)],
+)
+def test_an_edge_by_chance_does_not_close_a_gap(gap: float, by_chance: float, goes_on: bool) -> None:
+    """The next pipe in line begins beyond a `gap` [m] in whose middle an edge has these log odds; a clamp is 6 cm."""
+    along: FloatArray = np.arange(0.01, 1.0, 0.02).astype(np.float64)
+    odds: FloatArray = np.where(along < gap, -3.0, 8.0).astype(np.float64)
+    odds[int(0.5 * gap / 0.02)] = by_chance or -3.0
+    further = extension._further(AxialEvidence(along, odds, np.full_like(along, 15.0)), extension.CLAMP)
+    assert further == pytest.approx(1.0 if goes_on else 0.0)
 
 
 def test_the_odds_turn_where_the_pipe_ends(pipe_views: list[View]) -> None:
