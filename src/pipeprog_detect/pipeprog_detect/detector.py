@@ -24,6 +24,7 @@ from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.false_lines import is_false_line, is_one_step
 from pipeprog_detect.thin.hangers import is_hanger
+from pipeprog_detect.thin.longer_in_colour import longer_in_colour
 from pipeprog_detect.thin.thin_pipes import find_thin_pipes, in_colour, turned_parallel
 from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
@@ -177,6 +178,7 @@ def detect_outside(
         measured, judging, lambda each, others: not is_stub(each.cylinder) and is_supported(each, others)
     )
     report(0.95, "looking for thin pipes in the keyframes")
+    measured = longer_in_colour(measured, THICKEST_LINE, coloured)
     edges = memory.edges if memory else {}
     lost = find_thin_pipes(points, around, THICKEST_LINE, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)

@@ -23,6 +23,7 @@ from pipeprog_detect.thin.depth_from_cloud import covers, mean_centre
 from pipeprog_detect.thin.false_lines import is_bare, is_false_line
 from pipeprog_detect.thin.line_fitter import LineFitter, turned
 from pipeprog_detect.thin.line_triangulation import propose
+from pipeprog_detect.thin.longer_in_colour import longer_in_colour
 from pipeprog_detect.thin.pair_views import PairView, distinct_views, pair_views
 from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL, PARALLEL_SIGMA, parallel_directions
 from pipeprog_detect.types import Cylinder, View
@@ -69,7 +70,7 @@ def find_thin_pipes(
     if not views or not radii:
         return []
     known = [measured.cylinder for measured in found]
-    search = _Search(points.astype(np.float32, copy=False), around, thickest, radii, boq, known)
+    search = _Search(points.astype(np.float32, copy=False), around, thickest, radii, boq, known.copy())
     coloured = in_colour(views)
     if coloured:
         search.along_known_pipes(coloured, distinct_views(coloured, search.some, radii), again=views)
@@ -78,7 +79,7 @@ def find_thin_pipes(
     search.by_lines(views, seen)
     if coloured:
         search.by_lines(coloured, pair_views(coloured, search.some, radii, search.known, edges), again=views)
-    return search.thin
+    return longer_in_colour(search.thin, thickest, coloured, known)
 
 
 def in_colour(views: Sequence[View]) -> list[View]:
