@@ -188,7 +188,7 @@ def detect_outside(
     whole = with_open_ends(joined(measured, judging, context=around), around, judging)
     whole = joined(whole, judging, overlapping=True, context=around)
     whole = _judged(whole, judging, has_two_edges)
-    ended = _abutted(with_grown_ends(whole, judging), around, judging)
+    ended = _abutted(with_grown_ends(whole, judging), around, judging, coloured)
     standing = [each for each in ended if not is_hanger(each, prepared.points, around.planes)]
     return [each for each in standing if each.cylinder.length >= config.length_min]
 
@@ -263,8 +263,13 @@ def _judged(
     return [each for each, is_kept in zip(measured, kept, strict=True) if is_kept]
 
 
-def _abutted(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:
-    """The pipes as long as the walls that they run into allow, as far as there are views to tell, with their ends."""
+def _abutted(
+    measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View], coloured: Sequence[View]
+) -> list[MeasuredPipe]:
+    """The pipes as long as the walls that they run into allow, as far as there are views to tell, with their ends.
+
+    Colour may know an end of a thin pipe that grey leaves open.
+    """
     if not views:
         return [_with_ends_in_cloud(each) for each in measured]
     cylinders = [each.cylinder for each in measured]
@@ -273,7 +278,10 @@ def _abutted(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
         others = cylinders[:number] + cylinders[number + 1 :]
         each = measured[number]
         cylinder = with_ends_on_walls(each.cylinder, each.rims, around, views, others)
-        return replace(each, cylinder=cylinder, ends=ends_in_views(cylinder, around, views, others))
+        shown = [coloured] if coloured and cylinder.radius < THICKEST_LINE else []
+        known = [ends_in_views(cylinder, around, those, others) for those in (views, *shown)]
+        start, end = (min(several, key=lambda each: each.sigma) for several in zip(*known, strict=True))
+        return replace(each, cylinder=cylinder, ends=(start, end))
 
     return mapped(one, range(len(measured)))
 

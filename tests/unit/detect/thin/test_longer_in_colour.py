@@ -4,17 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
+from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
+from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.detector import _abutted
 from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.thin.longer_in_colour import longer_in_colour
 from pipeprog_detect.thin.thin_pipes import in_colour
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+from pipeprog_detect.verification.scene_context import SceneContext
 from sitegen.primitives import cylinder
 from sitegen.site import CONCRETE
 from tests.unit.detect.pipe_and_wall import front_points
@@ -25,14 +31,19 @@ PIPE = Cylinder(np.array([-0.45, -0.08, 0.02]), np.array([0.45, -0.08, 0.02]), 0
 NEXT = Cylinder(np.array([0.6, -0.08, 0.02]), np.array([1.0, -0.08, 0.02]), 0.0086)
 
 
+@cache
+def wall() -> FloatArray:
+    """Points of a wall in y = 0."""
+    x, z = np.meshgrid(np.arange(-1.5, 1.5, 0.01), np.arange(-0.5, 1.0, 0.01))
+    return np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+
+
 @pytest.fixture(scope="module")
 def views() -> list[View]:
-    """Views in colour, with what the cloud shows, of two copper pipes in line before a wall, 15 cm apart."""
+    """Views in colour, with what the cloud shows, of two copper pipes in line before the wall, 15 cm apart."""
     pipes = (PIPE, NEXT)
-    x, z = np.meshgrid(np.arange(-1.5, 1.5, 0.01), np.arange(-0.5, 1.0, 0.01))
-    wall = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     seen = walk_past([cylinder(each.start, each.end, each.radius, COPPER) for each in pipes])
-    return in_colour(with_depths(seen, np.vstack([wall, *(front_points(each) for each in pipes)])))
+    return in_colour(with_depths(seen, np.vstack([wall(), *(front_points(each) for each in pipes)])))
 
 
 def measured(piece: Cylinder) -> MeasuredPipe:
@@ -62,3 +73,16 @@ def test_a_whole_pipe_a_thick_one_and_one_without_colour_stay(views: list[View])
     assert same[0] is whole
     assert same[1] is thick
     assert longer_in_colour([part], 0.02, [])[0] is part
+
+
+def test_colour_knows_an_end_that_grey_leaves_open(views: list[View]) -> None:
+    """In grey the wall alone is seen: the pipe may end anywhere."""
+    tree = octree.build(wall())
+    around = SceneContext(tree, None, [Plane(np.array([0.0, -1.0, 0.0]), 0.0, 4.5)], tree, 1e-3)
+    grey = with_depths(walk_past([]), wall())
+    open_one, _ = _abutted([measured(PIPE), measured(NEXT)], around, grey, [])
+    assert all(end.sigma > 0.05 for end in open_one.ends)
+    known, _ = _abutted([measured(PIPE), measured(NEXT)], around, grey, views)
+    assert all(end.sigma < 0.01 and end.state == "free" for end in known.ends)
+    (thick,) = _abutted([measured(replace(PIPE, radius=0.04))], around, grey, views)
+    assert all(end.sigma > 0.05 for end in thick.ends)
