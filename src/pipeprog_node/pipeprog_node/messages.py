@@ -317,8 +317,11 @@ def _columns(table: NDArray[np.void], *names: str) -> NDArray[np.float32]:
     several = [name for name in names if table.dtype[name].shape]
     if several:
         raise InputError(f"the point cloud's field {several[0]} has several values for each point: one is needed")
+    columns = np.empty((len(table), len(names)), np.float32)
     with np.errstate(over="ignore"):  # infinity is what becomes of numbers beyond single precision
-        return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+        for number, name in enumerate(names):
+            columns[:, number] = table[name]
+    return columns
 
 
 def _listed(values: NDArray[np.float64]) -> str:
