@@ -15,6 +15,8 @@ from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 
+ROUNDING = 1e-9  # m: an end that has not moved is calculated anew from the other one
+
 
 def longer_in_colour(
     measured: Sequence[MeasuredPipe], thickest: float, coloured: Sequence[View], beside: Sequence[Cylinder] = ()
@@ -43,16 +45,16 @@ def _longer(measured: MeasuredPipe, views: Sequence[View], others: Sequence[Cyli
         if longer.length < whole.length + LEAST:
             break
         whole = longer
+    if whole is known:
+        return measured
     first, last = whole.along(np.stack([known.start, known.end])).tolist()
-    grown = first > 0.0, last < whole.length
+    grown = first > ROUNDING, last < whole.length - ROUNDING
     rims = list(measured.rims)
     for at_end in (False, True):
         if grown[at_end]:
             end = find_end(scene.turned_to(whole), at_end, None)
             rims[at_end] = 0.0 if end is None else end.odds
             whole = whole if end is None else whole.lengthened(at_end, end.position)
-    if not any(grown):
-        return measured
     fit = None if measured.fit is None else measured.fit.on(whole)
     candidate = replace(measured.candidate, cylinder=measured.candidate.cylinder.cut_like(whole))
     return replace(measured, candidate=candidate, cylinder=whole, rims=(rims[0], rims[1]), fit=fit)
