@@ -280,7 +280,7 @@ def _abutted(
         cylinder = with_ends_on_walls(each.cylinder, each.rims, around, views, others)
         shown = [coloured] if coloured and cylinder.radius < THICKEST_LINE else []
         known = [ends_in_views(cylinder, around, those, others) for those in (views, *shown)]
-        start, end = (min(several, key=lambda each: each.sigma) for several in zip(*known, strict=True))
+        start, end = (min(told, key=lambda end: end.sigma) for told in zip(*known, strict=True))
         return replace(each, cylinder=cylinder, ends=(start, end))
 
     return mapped(one, range(len(measured)))

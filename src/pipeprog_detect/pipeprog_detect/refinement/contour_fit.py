@@ -60,12 +60,12 @@ class ContourFit:
         """Whether the views surely show no flat strip: they see it from sides that differ enough."""
         return FLAT - self.flatness > SURELY * self.flatness_sigma
 
-    def on(self, longer: Cylinder) -> ContourFit:
-        """The fit of a longer piece of the same cylinder: away from the middle of its own the axis is known less."""
-        shift = float((longer.middle - self.cylinder.middle) @ self.cylinder.axis)
+    def on(self, piece: Cylinder) -> ContourFit:
+        """The fit of another piece of the same axis: away from the middle of its own the axis is known less."""
+        shift = float((piece.middle - self.cylinder.middle) @ self.cylinder.axis)
         moved = np.eye(5)
         moved[0:2, 2:4] = shift * np.eye(2)
-        return replace(self, cylinder=longer, covariance=moved @ self.covariance @ moved.T)
+        return replace(self, cylinder=piece, covariance=moved @ self.covariance @ moved.T)
 
 
 def contour_fit(found: AdjustedCylinder, ends: tuple[End | None, End | None]) -> ContourFit:

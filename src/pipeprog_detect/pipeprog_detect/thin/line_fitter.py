@@ -228,11 +228,11 @@ def _of_both(earlier: ContourFit, here: ContourFit) -> ContourFit:
     weights = 1.0 / np.array([earlier.radius_sigma, here.radius_sigma]) ** 2
     radius = float(np.average([earlier.cylinder.radius, here.cylinder.radius], weights=weights))
     probable = max(earlier, here, key=lambda fit: fit.log_odds)
-    cylinder = replace(here.cylinder.cut_like(probable.cylinder), radius=radius)
-    sigma = float(1.0 / np.sqrt(weights.sum()))
+    axis = here.on(here.cylinder.cut_like(probable.cylinder))
+    cylinder, sigma = replace(axis.cylinder, radius=radius), float(1.0 / np.sqrt(weights.sum()))
     scale = np.diag([1.0, 1.0, 1.0, 1.0, sigma / here.radius_sigma])
-    covariance = scale @ here.covariance @ scale
-    return replace(probable, cylinder=cylinder, across=here.across, covariance=covariance, radius_sigma=sigma)
+    covariance = scale @ axis.covariance @ scale
+    return replace(probable, cylinder=cylinder, across=axis.across, covariance=covariance, radius_sigma=sigma)
 
 
 def _keeps_depth(cylinder: Cylinder, expected: Sequence[tuple[Cylinder, float]], centre: FloatArray | None) -> bool:
