@@ -13,6 +13,7 @@ from pipeprog_detect.silhouette.apparent_contour import ViewArrays, in_image, pr
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
 from pipeprog_detect.silhouette.occlusion import BEFORE, cylinder_rows, hidden_by_cylinders
 from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.silhouette.surface_texture import face_log_odds
 from pipeprog_detect.types import Cylinder, View
 
 # Distance [m] between the positions looked at: less than a cell of a view's depths (8 px: 16 mm at 2 m with 1000 px).
@@ -45,10 +46,10 @@ def free_stretches(
 ) -> list[tuple[float, float]]:
     """Stretches (from, to) [m from the start] of the axis at which most views see a surface that lies behind it.
 
-    Where its contour is seen a stretch is a hole in the cloud of the pipe's face. It may be one where nothing of the
-    contour is seen: what hides it misleads stereo beside it. But beyond a `known` part that is much longer, and through
-    less of which the views see, a contour is that of something in line with the pipe, and where none is seen the pipe
-    has ended.
+    Where its contour is seen, or the texture of its face, a stretch is a hole in the cloud of the pipe's face. It may
+    be one where nothing of the contour is seen: what hides it misleads stereo beside it. But beyond a `known` part that
+    is much longer, and through less of which the views see, a contour is that of something in line with the pipe, and
+    where none is seen the pipe has ended.
 
     Args:
         cylinder: whose axis is looked at, and whose contour decides where stereo has holes.
@@ -59,8 +60,13 @@ def free_stretches(
     stretches = _seen_through(cylinder, views, others)
     supports = [Scene.of(cylinder.cut(*each), views, others).support(spacing=SPACING) for each in stretches]
     if known is None:
-        refuted = [one.share < MIN_SUPPORT and one.log_odds().sum() < -REFUTED for one in supports]
-        return [each for each, is_free in zip(stretches, refuted, strict=True) if is_free]
+        return [
+            each
+            for each, one in zip(stretches, supports, strict=True)
+            if one.share < MIN_SUPPORT
+            and one.log_odds().sum() < -REFUTED
+            and face_log_odds(cylinder.cut(*each), views, others) < REFUTED
+        ]
     holes = _holes(known, views, others) if stretches else 0.0
     return [
         (first, last)
