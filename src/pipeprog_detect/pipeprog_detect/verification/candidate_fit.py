@@ -48,6 +48,10 @@ class CandidateFitter:
         """Whether the fit has a radius of the bill of quantities, within its standard deviation."""
         return is_planned(fit.cylinder.radius, fit.radius_sigma, self.boq)
 
+    def has_planned_size(self, fit: ContourFit) -> bool:
+        """Whether the fit has a radius of the bill of quantities, to the tolerance of manufacture."""
+        return any(_has_size(fit, planned) for planned in self._radii())
+
     def is_planned_in_cloud(self, candidate: Candidate) -> bool:
         """Whether the cloud resolves the candidate's section and has a radius of the bill of quantities."""
         return is_resolved(candidate) and is_planned(candidate.cylinder.radius, _sigma(candidate), self.boq)
@@ -90,9 +94,7 @@ class CandidateFitter:
         side that is seen of a pipe does not tell its radius either. Of the radii that the cloud allows those are tried
         first that agree best with the fit and the cloud together.
         """
-        if fit is None or (
-            any(_has_size(fit, planned) for planned in self._radii()) and fit.radius_sigma < TOLD * fit.cylinder.radius
-        ):
+        if fit is None or (self.has_planned_size(fit) and fit.radius_sigma < TOLD * fit.cylinder.radius):
             return fit
         radius = fit.cylinder.radius
         told = np.array([radius, candidate.cylinder.radius])

@@ -20,7 +20,7 @@ from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter
 from pipeprog_detect.verification.measured_pipe import DECISIVE, MeasuredPipe, is_stub
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
-from pipeprog_detect.verification.radius_agreement import agree, contradict, is_resolved
+from pipeprog_detect.verification.radius_agreement import agree, contradict, doubts, is_resolved
 
 # Views of a candidate that suffice to tell it from a shadow; to measure it all are used.
 FEW_VIEWS = 30
@@ -207,10 +207,22 @@ class KeyframeVerifier:
         elif fit.support < CONVINCING:  # the cloud may lie beside the pipe by more than a contour is sought from there
             other = self._fitter.of_planned_radius(candidate, others, self._views)
             fit = other if other is not None and other.log_odds > fit.log_odds else fit
-        is_weak = trusted and fit.support < CONVINCING and self._fitter.is_planned_in_cloud(candidate)
-        if not self._fitter.is_planned(fit) and (is_weak or contradict(candidate, fit)):
+        if self._is_misled(candidate, fit, trusted):
             return MeasuredPipe.between_ends_of(candidate, fit)
         return MeasuredPipe.of_contour(candidate, fit)
+
+    def _is_misled(self, candidate: Candidate, fit: ContourFit, trusted: bool) -> bool:
+        """Whether the cloud's radius is more probable than that of a contour, which nobody planned.
+
+        Sizes that nobody planned are rarer than shadows along a pipe: where the cloud has a planned one, and hardly
+        that of a contour of another size, the contour is that of a shadow.
+        """
+        is_planned = self._fitter.is_planned(fit)
+        if not self._fitter.is_planned_in_cloud(candidate):
+            return not is_planned and contradict(candidate, fit)
+        if not self._fitter.has_planned_size(fit) and doubts(candidate, fit):
+            return True
+        return not is_planned and trusted and fit.support < CONVINCING
 
     def _shows_both_sides(self, cylinder: Cylinder, others: Sequence[Cylinder]) -> bool:
         """Whether it has edges on each side that is not hidden: a board or a step has them on one."""

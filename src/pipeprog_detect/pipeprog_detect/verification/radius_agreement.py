@@ -9,8 +9,9 @@ from pipeprog_detect.cloud.candidate import Candidate
 from pipeprog_detect.refinement.contour_fit import ContourFit
 
 # They contradict each other where they differ by more than this many standard deviations, the cloud's noise included,
-# and agree where they differ by less than this many (one in twenty pipes is beyond that).
-CONTRADICTION, AGREEMENT = 4.0, 2.0
+# and agree where they differ by less than this many (one in twenty pipes is beyond that). Beyond this many of them (one
+# in 400 pipes) one of both is more probably wrong, as a contour is along a shadow in one pipe of 60.
+CONTRADICTION, AGREEMENT, DOUBT = 4.0, 2.0, 3.0
 # The cloud resolves a section of five times its noise, seen along a third of the way around [rad], whose radius it
 # knows to a twentieth: the edge of a box is round, too, to a cloud. Two faces lie a tenth of the radius off the circle
 # along both: a section of thirty times the noise shows that, and is round wherever it is seen.
@@ -46,10 +47,15 @@ def contradict(candidate: Candidate, fit: ContourFit) -> bool:
     return excludes(candidate, fit.cylinder.radius, fit.radius_sigma)
 
 
-def excludes(candidate: Candidate, radius: float, radius_sigma: float) -> bool:
-    """Whether a cloud that resolves the section cannot have a radius [m], known to `radius_sigma` [m]."""
+def doubts(candidate: Candidate, fit: ContourFit) -> bool:
+    """Whether a cloud that resolves the section hardly has the radius of the contour."""
+    return excludes(candidate, fit.cylinder.radius, fit.radius_sigma, DOUBT)
+
+
+def excludes(candidate: Candidate, radius: float, radius_sigma: float, sigmas: float = CONTRADICTION) -> bool:
+    """Whether a cloud that resolves the section is `sigmas` from a radius [m], known to `radius_sigma` [m]."""
     sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, radius_sigma])
-    return is_resolved(candidate) and bool(abs(radius - candidate.cylinder.radius) > CONTRADICTION * sigma)
+    return is_resolved(candidate) and bool(abs(radius - candidate.cylinder.radius) > sigmas * sigma)
 
 
 def allows(candidate: Candidate, radius: float, radius_sigma: float) -> bool:

@@ -93,6 +93,21 @@ def test_a_contour_that_is_hardly_seen_does_not_overrule_the_planned_radius_of_t
     assert [each.cylinder.radius for each in measured] == [share * PIPE.radius]
 
 
+@pytest.mark.parametrize(("in_cloud", "share"), [(1.0, 1.0), (0.99, 0.964), (0.93, 0.964)])
+def test_a_contour_of_no_planned_size_gives_way_to_the_planned_one_that_the_cloud_has(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, in_cloud: float, share: float
+) -> None:
+    """A shadow along a pipe made its contour 3.6 % too thin; a cloud nearer than 3 sigma, or as thin, says nothing."""
+    thin = replace(PIPE, radius=0.964 * PIPE.radius)
+    contour = ContourFit(thin, np.eye(3)[1:], np.eye(5), 1e-4, 1.0, 80.0, 20, (0.0, 0.0), 0.0, 0.5)
+    monkeypatch.setattr(CandidateFitter, "fit", lambda *_, **__: contour)
+    monkeypatch.setattr(CandidateFitter, "near_planned", lambda *_: contour)
+    evidence = CloudEvidence(np.pi, 0.9, 0.0, 3e-4, 0.0, 300.0)
+    cloud = Candidate(replace(PIPE, radius=in_cloud * PIPE.radius), 2e-4, 900, evidence)
+    [measured] = KeyframeVerifier(pipe_views, BOQ).measure([cloud], [True])
+    assert measured.cylinder.radius == share * PIPE.radius
+
+
 def test_the_keyframes_measure_a_pipe_unless_contours_are_disabled(pipe_views: list[View]) -> None:
     points = np.concatenate([wall_points(), front_points(PIPE)])
     points = points + np.random.default_rng(3).normal(0.0, 1e-3, points.shape)
