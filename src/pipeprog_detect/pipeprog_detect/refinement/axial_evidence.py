@@ -59,6 +59,12 @@ class AxialEvidence:
         outside = self.along > 0.0
         return np.append(0.0, self.along[outside]), np.append(0.0, np.cumsum(self.log_odds[outside]))
 
+    def is_hidden(self, position: FloatArray) -> NDArray[np.bool_]:
+        """Whether nothing is seen within a step of the positions (T,) [m], outwards from the end."""
+        seen = self.along[self.seen > 0]
+        away = np.abs(np.subtract.outer(position, seen)).min(axis=1, initial=np.inf)
+        return np.asarray(away > float(np.diff(self.along).min()))
+
     def unseen_before_end(self) -> float:
         """Length [m] of the stretch before the end in which nothing is seen: the end was placed by other evidence."""
         seen = self.along[(self.along < 0.0) & (self.seen > 0.0)]

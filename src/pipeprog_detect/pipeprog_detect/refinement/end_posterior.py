@@ -19,6 +19,7 @@ from pipeprog_detect.refinement.pipe_ends import (
     SAMPLES_PER_PIXEL,
     all_around,
     before_bend,
+    by_chance,
     pixel_at,
     rim_strength,
 )
@@ -67,7 +68,8 @@ def end_posterior(cylinder: Cylinder, at_end: bool, views: Sequence[View], other
 
     Prior: ends occur as a Poisson process with one end per measured length. The contour tells how far the pipe goes,
     to some samples; an edge all around the barrel tells it to half a pixel. Where something hides the pipe the prior is
-    all there is: the end may lie anywhere in the hidden stretch, before the given end as well as beyond it.
+    all there is: the end may lie anywhere in the hidden stretch, before the given end as well as beyond it, and an edge
+    that is seen all around elsewhere may be a clamp's.
 
     Args:
         cylinder: the measured pipe.
@@ -97,7 +99,10 @@ def end_posterior(cylinder: Cylinder, at_end: bool, views: Sequence[View], other
     if showing:
         around = position < near
         strength, seen = rim_strength(barrel, position[around], showing, others)
-        odds[around] += RIM_WORTH * np.maximum(all_around(strength, seen), 0.0)
+        rims = RIM_WORTH * np.maximum(all_around(strength, seen), 0.0)
+        odds[around] += rims
+        if evidence is not None:
+            odds[evidence.is_hidden(position)] += max(float(rims.max(initial=0.0)) - by_chance(pixel), 0.0)
     return EndPosterior.of_odds(position, odds, RIM_SIGMA * pixel, in_view)
 
 

@@ -30,6 +30,9 @@ OUTSIDE, OUTSIDE_RADII, MOST_INSIDE = 0.15, 3.0, 0.6
 # three thousand), and an edge all around the barrel is worth at most three times as much: the contour tells the
 # position to some samples, the rim within them.
 PLAUSIBLE, RIM_WORTH = 8.0, 25.0
+# Edges all around a barrel in a metre of it that are no end: a clamp, a weld or a coupling has two. To a pixel, one is
+# no more probable at an end than such an edge is by chance.
+OTHER_RIMS = 2.0
 # Pixels beside what hides the barrel that are left out: its edge is none of the barrel's.
 BESIDE_HIDDEN = 4
 # Width of a rim's own edge [px].
@@ -109,7 +112,12 @@ def find_end(scene: Scene, at_end: bool, surface_end: float | None) -> End | Non
         odds = odds - np.log1p(((position - surface_end) / SURFACE_SIGMA) ** 2)
     likely = before_bend(np.interp(along, position, odds) - float(odds.max()), along, evidence, cylinder.radius, pixel)
     best = int(np.argmax(np.where(likely > -PLAUSIBLE, likely + RIM_WORTH * rim, -np.inf)))
-    return End(*_refined(strength, seen, along, best, pixel), RIM_WORTH * _contrast(rim, best))
+    return End(*_refined(strength, seen, along, best, pixel), min(RIM_WORTH * _contrast(rim, best), by_chance(pixel)))
+
+
+def by_chance(pixel: float) -> float:
+    """Log odds of an edge all around being an end's, seen to a `pixel` [m], where nothing else tells of the end."""
+    return -float(np.log(OTHER_RIMS * pixel))
 
 
 def into_bend(radius: float, aside: float) -> float:

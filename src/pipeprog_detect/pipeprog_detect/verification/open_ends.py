@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.refinement.axial_evidence import FARTHEST, axial_evidence
-from pipeprog_detect.refinement.extension import CERTAIN, LEAST, MAX_EXTENSIONS
+from pipeprog_detect.refinement.extension import LEAST, MAX_EXTENSIONS
 from pipeprog_detect.silhouette.apparent_contour import in_image, views_showing
 from pipeprog_detect.silhouette.free_space import MIN_VIEWS, free_stretches
 from pipeprog_detect.silhouette.scene import Scene
@@ -57,8 +57,6 @@ def _further(
 ) -> float:
     """How far [m] beyond a given end the pipe is expected to end; 0 where that is less than the ends are known to."""
     cylinder, rim, further = measured.cylinder, measured.rims[at_end], 0.0
-    if rim > CERTAIN:
-        return 0.0
     for _ in range(MAX_EXTENSIONS):
         longer = cylinder.lengthened(at_end, further)
         ahead = _clear(longer, at_end, context, views, others)

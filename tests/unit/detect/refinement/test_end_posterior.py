@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
+from pipeprog_detect.refinement import end_posterior as end_posterior_module
 from pipeprog_detect.refinement.axial_evidence import AxialEvidence
 from pipeprog_detect.refinement.end_posterior import EndPosterior, contour_odds, end_posterior
+from pipeprog_detect.refinement.pipe_ends import SECTORS
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE
 
@@ -70,6 +73,23 @@ def test_what_is_hidden_or_out_of_view_may_go_on(pipe_views: list[View]) -> None
     nowhere = end_posterior(far, True, pipe_views, [])
     assert not nowhere.in_view
     assert nowhere.sigma() > 0.3
+
+
+def test_an_edge_right_before_what_hides_the_rest_may_be_a_clamps(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pipe across hides 0.3 m behind an edge all around; behind that is the wall."""
+    known = PIPE.cut(0.0, 0.5 * PIPE.length)
+    middle = known.end + 0.12 * PIPE.axis + np.array([0.0, -0.25, 0.0])
+    across = Cylinder(middle - np.array([0.6, 0.0, 0.0]), middle + np.array([0.6, 0.0, 0.0]), 0.12)
+
+    def edge(barrel: Cylinder, along: FloatArray, *_: object) -> tuple[FloatArray, NDArray[np.bool_]]:
+        strength = np.tile(0.9 * (np.abs(along) < 2e-3), (4 * SECTORS, 1)).astype(float)
+        return strength, np.ones(strength.shape, bool)
+
+    monkeypatch.setattr(end_posterior_module, "rim_strength", edge)
+    assert end_posterior(known, True, pipe_views, [across]).sigma() > 0.3 / 6.0
+    assert end_posterior(PIPE, True, pipe_views, []).sigma() < 4e-3, "where nothing hides the rest it is the end"
 
 
 def test_an_end_on_a_wall_may_lie_anywhere_in_the_hidden_stretch_before_it(pipe_views: list[View]) -> None:

@@ -68,7 +68,8 @@ def test_the_edge_of_what_hides_a_pipe_is_not_its_end(pipe_views: list[View]) ->
 def test_an_end_rim_raises_the_odds_of_an_end(pipe_views: list[View]) -> None:
     found = find_end(Scene.of(PIPE, pipe_views, []), True, None)
     assert found is not None
-    assert found.odds > 1.0
+    # A clamp has such edges, too, two in each metre: to a pixel (3.5 mm) that is one in 144.
+    assert 1.0 < found.odds < np.log(144.0)
 
 
 def test_what_ends_may_be_an_elbow_unless_it_is_hidden() -> None:

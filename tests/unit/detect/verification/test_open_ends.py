@@ -63,3 +63,10 @@ def test_a_certain_rim_is_an_end_whatever_hides_what_is_behind_it(pipe_views: li
     pipe, cover = behind(hiding(*HIDDEN))
     kept, _ = with_open_ends([measured(pipe.cylinder, (2.0 * CERTAIN, 0.0)), cover], FAR_FLOOR, pipe_views)
     np.testing.assert_allclose(kept.cylinder.start, pipe.cylinder.start)
+
+
+def test_a_rim_is_a_clamps_where_the_contour_goes_on_behind_what_hides_it(pipe_views: list[View]) -> None:
+    pipe, cover = behind(hiding(KNOWN - 0.04, KNOWN))
+    longer, _ = with_open_ends([measured(pipe.cylinder, (1.1 * CERTAIN, 0.0)), cover], FAR_FLOOR, pipe_views)
+    assert height_of_start(longer.cylinder) == pytest.approx(PIPE.start[2], abs=0.02)
+    assert longer.rims == (0.0, 0.0)
