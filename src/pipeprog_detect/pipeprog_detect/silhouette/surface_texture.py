@@ -28,7 +28,7 @@ MOST_VIEWS, LEAST_VIEWS = 12, 3
 # A view tells where it sees this share of the face and more.
 SEEN = 0.7
 # Places behind the face that are tried: from one and a half radii behind the axis to this far [m], evenly in inverse
-# depth, a pixel or two apart where cameras are half a metre apart.
+# depth: two pixels apart where cameras are half a metre apart and see the cylinder at two metres.
 BEHIND_RADII, FARTHEST, PLACES = 1.5, 2.0, 48
 # Light (0 to 255) by which a patch varies at the least: rounding to grey levels alone makes a third of it.
 LEAST_SPREAD = 1.0
