@@ -12,11 +12,11 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.refinement.axial_evidence import AxialEvidence, axial_evidence
-from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ViewArrays, project
+from pipeprog_detect.silhouette.apparent_contour import ViewArrays
 from pipeprog_detect.silhouette.edge_support import NEAR
-from pipeprog_detect.silhouette.light_sampling import light_at
-from pipeprog_detect.silhouette.occlusion import cylinder_rows, hidden_by_cloud, hidden_by_cylinders
+from pipeprog_detect.silhouette.occlusion import cylinder_rows
 from pipeprog_detect.silhouette.scene import Scene
+from pipeprog_detect.silhouette.surface_light import light_on
 from pipeprog_detect.types import Cylinder, View
 
 # The part of the barrel that faces the camera steeply enough to resolve lengths on it: half of its arc [rad], the
@@ -221,22 +221,11 @@ def _slopes(barrel: Cylinder, along: FloatArray, view: View, others: FloatArray)
     angle = np.linspace(-HALF_ARC, HALF_ARC, SECTORS * RAYS_PER_SECTOR)
     radial = np.cos(angle)[:, None] * towards + np.sin(angle)[:, None] * np.cross(axis, towards)
     points = end + along[None, :, None] * axis + barrel.radius * radial[:, None]
-    pixel, depth = project(view, points.reshape(-1, 3))
-    camera, shown = view.camera, view.shown(pixel, depth)
-    sharp = (
-        (depth > NEAR_PLANE)
-        & (shown > 2).all(axis=1)
-        & (shown[:, 0] < camera.width - 3)
-        & (shown[:, 1] < camera.height - 3)
-    )
-    there, deep = pixel[sharp], depth[sharp]
-    sharp[sharp] = ~(hidden_by_cylinders(view, there, deep, others) | hidden_by_cloud(view, there, deep))
+    light, sharp = light_on(points.reshape(-1, 3), view, others)
     inside = sharp.reshape(SECTORS, RAYS_PER_SECTOR, -1).all(axis=1)
     inside = minimum_filter1d(inside, 2 * BESIDE_HIDDEN * SAMPLES_PER_PIXEL + 1, axis=1)
     if not inside.any():
         return unseen
-    light = np.zeros(len(pixel))
-    light[sharp] = light_at(view.image, shown[sharp])
     mean = light.reshape(SECTORS, RAYS_PER_SECTOR, -1).mean(axis=1)
     return np.where(inside, gaussian_filter1d(mean, SAMPLES_PER_PIXEL, axis=1, order=1), np.nan)
 

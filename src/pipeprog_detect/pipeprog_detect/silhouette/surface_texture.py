@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
-from pipeprog_detect.silhouette.apparent_contour import NEAR_PLANE, ViewArrays, project
-from pipeprog_detect.silhouette.light_sampling import light_at
-from pipeprog_detect.silhouette.occlusion import cylinder_rows, hidden_by_cloud, hidden_by_cylinders
+from pipeprog_detect.silhouette.apparent_contour import ViewArrays, project
+from pipeprog_detect.silhouette.occlusion import cylinder_rows
 from pipeprog_detect.silhouette.scene import frame, viewing_direction
+from pipeprog_detect.silhouette.surface_light import light_on
 from pipeprog_detect.types import Cylinder, View
 
 # Distance of the samples on the face [px]: what lens and pixel blur together; more where they would be more than this
@@ -79,20 +79,16 @@ def _explained(surface: FloatArray, views: Sequence[View], others: FloatArray) -
     points = surface.reshape(-1, 3)
     patches, masks = [], []
     for view in views:
-        pixel, depth = project(view, points)
-        shown = view.shown(pixel, depth)
-        size = np.array([view.camera.width, view.camera.height])
-        seen = (depth > NEAR_PLANE) & (shown > 0).all(axis=1) & (shown < size - 1).all(axis=1)
-        seen &= ~(hidden_by_cylinders(view, pixel, depth, others) | hidden_by_cloud(view, pixel, depth))
+        patch, seen = light_on(points, view, others)
         if seen.mean() > SEEN:
-            patches.append(light_at(view.image, shown))
+            patches.append(patch)
             masks.append(seen)
     if len(patches) < LEAST_VIEWS:
         return 0.0
     together = np.all(masks, axis=0)
     if together.sum() < LEAST_SAMPLES:
         return 0.0
-    light = np.stack(patches).astype(np.float64)
+    light = np.stack(patches)
     light -= light[:, together].mean(axis=1)[:, None]
     light[:, ~together] = 0.0
     spread = np.sqrt((light**2).sum(axis=1) / together.sum())

@@ -53,7 +53,7 @@ def doubts(candidate: Candidate, fit: ContourFit) -> bool:
 
 
 def excludes(candidate: Candidate, radius: float, radius_sigma: float, sigmas: float = CONTRADICTION) -> bool:
-    """Whether a cloud that resolves the section is `sigmas` from a radius [m], known to `radius_sigma` [m]."""
+    """Whether a cloud that resolves the section differs by more than `sigmas` from a radius +- `radius_sigma` [m]."""
     sigma = np.linalg.norm([candidate.radius_sigma, candidate.evidence.noise, radius_sigma])
     return is_resolved(candidate) and bool(abs(radius - candidate.cylinder.radius) > sigmas * sigma)
 
