@@ -17,9 +17,9 @@ from typing import Any
 
 from rclpy.node import Node
 
+from pipeprog_node.processes.freed_memory import keep_freed_memory
+
 _PR_SET_PDEATHSIG = 1
-# glibc's malloc.h: M_TRIM_THRESHOLD, M_MMAP_THRESHOLD [bytes], M_ARENA_MAX
-_KEEP_FREED_MEMORY = ((-1, 1 << 30), (-3, 1 << 30), (-8, 1))
 
 
 class WorkerProcess:
@@ -113,12 +113,8 @@ class _Death:
 
 def _child_main(connection: Connection, serve: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     # The kernel ends the child with its parent, however that dies; Ctrl-C is the parent's to handle.
-    libc = ctypes.CDLL(None)
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    # Arrays of 1 to 200 MB come and go: each one's pages, given back and cleared anew, would cost as much as filling
-    # them (measured: an eighth of a depth map's time).
-    for parameter, value in _KEEP_FREED_MEMORY:
-        libc.mallopt(parameter, value)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(EOFError, BrokenPipeError):  # the parent is gone
         serve(connection, *arguments)
