@@ -13,7 +13,7 @@ from pipeprog_detect.cloud.acceptance import THICKEST_LINE
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
-from pipeprog_detect.verification.walls_across import MEETS
+from pipeprog_detect.verification.planes_met import MEETS
 
 # Rods are at most this long [m]: racks hang below a ceiling, not amid a room. Pipes of this length that come out of a
 # wall end in the open, or in a pipe.

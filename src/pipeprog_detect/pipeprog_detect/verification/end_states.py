@@ -11,9 +11,9 @@ from pipeprog_detect.cloud.axial_extent import bin_length
 from pipeprog_detect.refinement.end_posterior import end_posterior
 from pipeprog_detect.refinement.extension import LEAST
 from pipeprog_detect.types import Cylinder, PipeEnd, View
+from pipeprog_detect.verification.planes_met import ON_PLANE
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import planes_ahead
-from pipeprog_detect.verification.walls_across import ON_PLANE
 
 
 def ends_in_views(

@@ -19,8 +19,8 @@ from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+from pipeprog_detect.verification.planes_met import distance_to
 from pipeprog_detect.verification.scene_context import SceneContext
-from pipeprog_detect.verification.walls_across import MEETS
 
 # Distance [m] between the positions of the end that are weighed: the step of a free stretch.
 STEP = 0.01
@@ -112,9 +112,8 @@ def _clear(
     end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
     ahead = _looked_ahead(cylinder)
     for plane in context.planes:
-        slope = float(plane.normal @ out)
-        distance = float(plane.offset - plane.normal @ end) / slope if abs(slope) > MEETS else ahead
-        ahead = min(ahead, distance) if distance > 0.0 else ahead
+        distance = distance_to(plane, end, out)
+        ahead = min(ahead, distance) if distance is not None and distance > 0.0 else ahead
     place = np.arange(STEP, ahead, STEP)
     points = _beyond(cylinder, at_end, place)
     shown = np.sum([in_image(view, points) for view in views], axis=0)

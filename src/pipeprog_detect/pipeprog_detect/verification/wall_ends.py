@@ -14,8 +14,8 @@ from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification.planes_met import LEAST_POINTS, SAME_PLANE, distance_to, points_on, surrounds
 from pipeprog_detect.verification.scene_context import SceneContext
-from pipeprog_detect.verification.walls_across import LEAST_POINTS, MEETS, SAME_PLANE, points_on, surrounds
 
 # Views that suffice to tell whether the pipe goes on.
 ENOUGH_VIEWS = 12
@@ -71,12 +71,9 @@ def _distance(
     end: FloatArray, out: FloatArray, cylinder: Cylinder, plane: Plane, context: SceneContext, views: Sequence[View]
 ) -> float | None:
     """How far [m] beyond the end, or before it, the axis meets the plane; None where that says nothing of the end."""
-    slope = float(plane.normal @ out)
-    if abs(slope) < MEETS:
-        return None
-    distance = float(plane.offset - plane.normal @ end) / slope
+    distance = distance_to(plane, end, out)
     # Half of the ends lie within ln 2 of the mean distance between them; of what a plane hides a radius is left.
-    if not cylinder.radius - cylinder.length < distance < np.log(2.0) * cylinder.length:
+    if distance is None or not cylinder.radius - cylinder.length < distance < np.log(2.0) * cylinder.length:
         return None
     offset = points_on(plane.normal, end + distance * out, context)
     if len(offset) < LEAST_POINTS:
