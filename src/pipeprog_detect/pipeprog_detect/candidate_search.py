@@ -45,6 +45,10 @@ _LEAST_BENT = 14.6
 # Surfaces that are seen from twice the distance of most, or in a corner, are rougher than the cloud's noise tells: the
 # noise of stereo grows with the square of the distance.
 _ROUGHER = 4.0
+# Pieces in line are one pipe where it explains more than this share of the points of each: most of them.
+_EXPLAINED = 0.5
+# What clamps, flanges and couplings hide of a pipe is shorter than this [m].
+_LONGEST_FITTING = 0.1
 
 Report = Callable[[float, str], None]
 
@@ -268,10 +272,33 @@ class Search:
         """
         for again in (False, True):
             joined = join([candidate.cylinder for candidate in accepted])
-            measured = mapped(partial(self._refit, accepted, again), joined)
-            accepted = [candidate for candidate in measured if candidate is not None]
+            accepted = list(chain.from_iterable(mapped(partial(self._of_pieces, accepted, again), joined)))
         bends = elbows([candidate.cylinder for candidate in accepted])
         return [candidate for number, candidate in enumerate(accepted) if number not in bends]
+
+    def _of_pieces(self, accepted: Sequence[Candidate], again: bool, pieces: Sequence[int]) -> list[Candidate]:
+        """The candidate of collinear `pieces`, or one of each piece where a single pipe does not explain the points.
+
+        Where there are keyframes, those that tell by themselves whether they are one pipe are left to them.
+        """
+        if self.verifier.has_views:
+            apart = _told_apart([accepted[piece].cylinder for piece in pieces])
+            if len(apart) > 1:
+                parts = [[pieces[number] for number in part] for part in apart]
+                return list(chain.from_iterable(self._of_pieces(accepted, again, part) for part in parts))
+        whole = self._refit(accepted, again, pieces)
+        if len(pieces) > 1 and (whole is None or not all(self._explains(whole, accepted[piece]) for piece in pieces)):
+            alone = (self._refit(accepted, again, [piece]) for piece in pieces)
+            return [candidate for candidate in alone if candidate is not None]
+        return [] if whole is None else [whole]
+
+    def _explains(self, whole: Candidate, piece: Candidate) -> bool:
+        """Whether most of the points on a piece's surface lie on that of the `whole`, whatever lies beside them."""
+        cylinder, reach = piece.cylinder, 3.0 * piece.band
+        points = self.tree.points[self.tree.near_segment(cylinder.start, cylinder.end, cylinder.radius + reach)]
+        surface = points[np.abs(cylinder.surface_distance(points)) < reach]
+        explained = np.abs(whole.cylinder.surface_distance(surface)) < 3.0 * whole.band
+        return bool(explained.sum() > _EXPLAINED * len(surface))
 
     def _refit(self, accepted: Sequence[Candidate], again: bool, pieces: Sequence[int]) -> Candidate | None:
         """One candidate of the `pieces` of one pipe, None where the cloud makes no pipe of it and no keyframe may."""
@@ -293,3 +320,26 @@ class Search:
             return candidate
         # Where there are keyframes, they will measure it.
         return replace(accepted[best], cylinder=cylinder) if self.verifier.has_views else None
+
+
+def _told_apart(pieces: Sequence[Cylinder]) -> list[list[int]]:
+    """The numbers of collinear pieces, parted at each gap that is no fitting's and shorter than what is on either side.
+
+    An axis is extrapolated over half of such a gap with hardly more than its own error.
+    """
+    axis = pieces[0].axis
+    ends = np.sort([[float(each.start @ axis), float(each.end @ axis)] for each in pieces], axis=1)
+    runs: list[list[int]] = []
+    for number in np.argsort(ends[:, 0]).tolist():
+        if runs and ends[number, 0] - ends[runs[-1], 1].max() < _LONGEST_FITTING:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    parts = runs[:1]
+    for run in runs[1:]:
+        before, after = ends[parts[-1]], ends[run]
+        if after.min() - before.max() < min(np.ptp(before), np.ptp(after)):
+            parts.append(run)
+        else:
+            parts[-1].extend(run)
+    return parts

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.candidate_search import Search
@@ -100,3 +102,37 @@ def test_a_pipe_whose_points_are_rougher_than_most_is_found(pipe_views: list[Vie
         # The next map has the same points, none of which is new.
         again = search.candidates(~every, [candidate.cylinder for candidate in candidates], [])
         assert len(again) == count
+
+
+def two_in_line(gap: float, offset: float, first: float, second: float, shorter: float) -> FloatArray:
+    """Points of the front halves of two pipes along x with a gap [m]; the second, a `shorter` one, lies behind [m]."""
+    rng = np.random.default_rng(0)
+
+    def half(low: float, high: float, behind: float, radius: float) -> FloatArray:
+        count = int(9000 * (high - low))
+        along, angle = rng.uniform(low, high, count), rng.uniform(-0.5 * np.pi, 0.5 * np.pi, count)
+        distance = radius + rng.normal(0.0, 1.5e-3, count)
+        return np.stack([along, behind - distance * np.cos(angle), distance * np.sin(angle)], axis=1)
+
+    return np.vstack([half(-2.0, -0.5 * gap, 0.0, first), half(0.5 * gap, shorter, offset, second)])
+
+
+@given(gap=st.floats(0.05, 0.29), aside=st.floats(0.6, 1.0), shorter=st.floats(0.6, 2.0))
+@settings(max_examples=6, deadline=None)
+def test_pipes_in_line_that_one_does_not_explain_are_two(gap: float, aside: float, shorter: float) -> None:
+    """Sizes a ninth apart, axes aside by what a pipe might be: no cylinder has the points of both."""
+    points = two_in_line(gap, aside * 0.027, 0.1223, 0.1095, shorter)
+    search = search_in(points, 1.5e-3, [], 0.1223)
+    found = search.candidates(np.ones(len(points), bool), [], [])
+    radii = sorted(each.cylinder.radius for each in found)
+    assert radii == [pytest.approx(0.1095, abs=2e-3), pytest.approx(0.1223, abs=2e-3)]
+
+
+@given(gap=st.floats(0.05, 0.29), shorter=st.floats(0.6, 2.0))
+@settings(max_examples=4, deadline=None)
+def test_pieces_of_one_pipe_are_one_candidate(gap: float, shorter: float) -> None:
+    """Without keyframes: those have the last word where the pieces tell their axes themselves."""
+    points = two_in_line(gap, 0.0, 0.1095, 0.1095, shorter)
+    [found] = search_in(points, 1.5e-3, [], 0.1095).candidates(np.ones(len(points), bool), [], [])
+    assert found.cylinder.radius == pytest.approx(0.1095, abs=5e-4)
+    assert found.cylinder.length == pytest.approx(2.0 + shorter, abs=0.02)

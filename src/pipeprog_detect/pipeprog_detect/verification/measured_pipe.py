@@ -24,6 +24,9 @@ from pipeprog_detect.verification.walls_across import stretches_in_walls
 SLENDER = 20.0
 # Pieces of one pipe have one radius, to four standard deviations and the tolerance of manufacture (1 %, EN 10255).
 SAME_RADIUS, MANUFACTURE = 4.0, 0.01
+# And one axis, to as many of them. A pipe may be bent by 0.15 % of its length (EN 10216-1): two lines along parts of an
+# arc aim past each other by two thirds of its rise at the most, which is taken as three standard deviations.
+SAME_AXIS, STRAIGHT = 4.0, 0.0015 * 2.0 / 9.0
 # Logarithm of the odds from which evidence is called decisive (Jeffreys: a hundred to one), for each of the forty lines
 # of a map that are tried (Bonferroni; `thin_pipes.MOST_PROPOSED`).
 DECISIVE = float(np.log(100.0 * 40.0))
@@ -122,7 +125,10 @@ def _without_gaps(
 
 
 def _continues(one: MeasuredPipe, other: MeasuredPipe, views: Sequence[View], context: SceneContext | None) -> bool:
-    """Whether two collinear pieces may be one pipe: of one radius, and there is no wall nor a free gap between them."""
+    """Whether two collinear pieces may be one pipe.
+
+    They have one radius and one axis, and there is no wall nor a free gap between them.
+    """
     sigma = float(np.hypot(one.radius_sigma, other.radius_sigma))
     allowed = SAME_RADIUS * sigma + MANUFACTURE * one.cylinder.radius
     if abs(one.cylinder.radius - other.cylinder.radius) > allowed:
@@ -132,8 +138,23 @@ def _continues(one: MeasuredPipe, other: MeasuredPipe, views: Sequence[View], co
     gap = Cylinder(start, end, one.cylinder.radius)
     if gap.length <= SHORTEST:
         return True
+    if not _is_on_one_axis(one, other, gap):
+        return False
     with_ends = gap.cut(-2.0 * gap.radius, gap.length + 2.0 * gap.radius)  # the pieces may end at the walls
     return not (context and stretches_in_walls(with_ends, context, views, [])) and not free_stretches(gap, views, [])
+
+
+def _is_on_one_axis(one: MeasuredPipe, other: MeasuredPipe, gap: Cylinder) -> bool:
+    """Whether the axes that two contours tell, continued to the middle of the `gap` between them, may be one."""
+    if one.fit is None or other.fit is None:
+        return True
+    fits = (one.fit.on(gap), other.fit.on(gap))
+    bent = STRAIGHT * (one.cylinder.length + gap.length + other.cylinder.length)
+    covariance = bent**2 * np.eye(3) + sum(fit.across.T @ fit.covariance[:2, :2] @ fit.across for fit in fits)
+    across = one.fit.across
+    offset = across @ (one.cylinder.from_axis(gap.middle[None])[0] - other.cylinder.from_axis(gap.middle[None])[0])
+    square = offset @ np.linalg.solve(across @ covariance @ across.T, offset)
+    return bool(square < SAME_AXIS**2)
 
 
 def _overlap(one: MeasuredPipe, other: MeasuredPipe) -> bool:

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
+from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, joined
 from tests.unit.detect.pipe_and_wall import PIPE
@@ -78,6 +81,28 @@ def test_pipes_in_line_of_two_radii_or_two_axes_are_two(gap: float, offset: floa
     """Whatever hides the gap between them: an axis leaves the other one by a quarter of the radius and 4 mm."""
     assume(first != second or offset > 0.25 * first + 4e-3)
     assert len(joined(in_line(gap, offset, first, second), [])) == 2
+
+
+def with_contour(measured: MeasuredPipe, sideways: float, away: float, turned: float) -> MeasuredPipe:
+    """A pipe along x whose contour is known to these standard deviations [m, m, rad], as seen along y."""
+    covariance = np.diag([sideways, away, turned, turned, 2e-4]) ** 2
+    across = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    fit = ContourFit(measured.cylinder, across, covariance, 2e-4, 0.9, 100.0, 20, (0.0, 0.0), 0.0, 0.5)
+    return replace(measured, fit=fit)
+
+
+@given(gap=st.floats(0.05, 0.3), offset=st.floats(0.0, 0.02), size=st.sampled_from([0.0841, 0.1095, 0.1223]))
+@settings(max_examples=50, deadline=None)
+def test_contours_tell_axes_apart_by_their_own_evidence(gap: float, offset: float, size: float) -> None:
+    """Axes that an eye takes for one are two where the contours know them; a distance that they do not is nothing."""
+    pieces = in_line(gap, offset, size, size)
+    known = [with_contour(piece, 3e-4, 5e-3, 1e-4) for piece in pieces]
+    sigma = np.hypot(np.hypot(3e-4, 1e-4 * 0.5 * HALF) * np.sqrt(2.0), 0.0015 * 2.0 * HALF * 2.0 / 9.0)
+    assume(not 3.5 * sigma < offset < 4.5 * sigma)
+    assert len(joined(known, [])) == (1 if offset < 4.0 * sigma else 2)
+    vague = [with_contour(piece, 5e-3, 3e-4, 1e-4) for piece in pieces]
+    assert len(joined(vague, [])) == 1
+    assert len(joined(pieces, [])) == 1, "the cloud alone tells an axis to a quarter of the radius"
 
 
 @given(gap=st.floats(0.1, 0.5), radius=st.sampled_from([0.0365, 0.0575]))
