@@ -36,6 +36,10 @@ CLOSE_GATE = 0.25  # of the radius, around the centres that a verified pose pred
 PREDICTED_GATE = 0.5  # of the radius, around those of a known pose: a board that contradicts its file is still found
 MAX_AXIS_ERROR = 0.2  # of the semi-major axis, of both semi-axes against the predicted ones ...
 MIN_AXIS_ERROR = 1.5  # ... but never less than this, px: blur and exposure widen the image of a bright disc
+# A disc that something hides a part of still makes an ellipse, whose centre is pixels off. Its edge points lie off it
+# by several times as much as those of the other discs of the image, which have the same noise and blur, and by more
+# than noise alone explains [px].
+ROUGHER, ROUGH = 4.0, 0.2
 MAX_STARTS = 4  # triangles that a pose is started from: those of a rectangle are equally large
 MAX_START_MISFIT = 4.0  # of the three ellipses that start a pose, in units of the largest allowed after refinement
 MARGIN = 4.0  # px from the image's edge within which a circle may be missed
@@ -279,7 +283,10 @@ def _matched_circles(
     pose: FloatArray,
     gate: float,
 ) -> BoardFit:
-    """The pose with the circles that have a free ellipse within `gate` radii of their predicted centre, one to one."""
+    """The pose with the circles that have a free ellipse within `gate` radii of their predicted centre, one to one.
+
+    Those that something hides a part of are left out.
+    """
     centres, shapes = project_circles(matrix, pose, board.centres, board.circle_radius)
     if not np.isfinite(shapes).all():  # the camera is in the plane of the board
         return BoardFit(pose, np.empty(0, np.intp), np.empty(0, np.intp))
@@ -291,6 +298,8 @@ def _matched_circles(
     gaps[sizes > np.maximum(MAX_AXIS_ERROR * predicted[:, 1], MIN_AXIS_ERROR)[:, None]] = np.inf
     nearest = gaps.argmin(1)
     circles = np.flatnonzero((gaps.min(1) < gate) & (gaps.argmin(0)[nearest] == np.arange(len(nearest))))
+    rms = ellipses.rms[nearest[circles]]
+    circles = circles[rms <= max(ROUGHER * rms.min(initial=np.inf), ROUGH)]
     return BoardFit(pose, circles, nearest[circles])
 
 

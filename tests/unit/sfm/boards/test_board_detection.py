@@ -15,6 +15,7 @@ from pipeprog_sfm.config import BoardConfig
 
 CONFIG = BoardConfig()
 CENTRE_TOLERANCE = 0.06  # px; edges of 64 profiles at grey noise 2 and contrast 155
+PARTLY_HIDDEN = 0.6  # px, of a disc of 20 px: its ellipse is up to 3.5 px off
 
 
 def images_of_centres(board, pose, camera=CAMERA):
@@ -66,6 +67,24 @@ def test_a_board_is_followed_where_its_ellipses_move():
     np.testing.assert_array_equal(followed.ellipse_centres, expected.ellipse_centres)
     np.testing.assert_array_equal(followed.conics, expected.conics)
     np.testing.assert_allclose(followed.centres, images_of_centres(BOARD, after), atol=0.01)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.05, 0.6), st.integers(0, 200))
+def test_a_circle_that_is_partly_hidden_is_left_out_or_exact(share, grey):
+    """A pipe before the board hides the upper part of its uppermost circles, each over a share of its height."""
+    pose = camera_from_board((0.0, 0.1, 1.0), (0, 0, 0), roll=0.02)
+    image = render(BOARD, pose)
+    centres = images_of_centres(BOARD, pose)
+    radius = BOARD.circle_radius * CAMERA.fx / np.linalg.norm(pose[:3, 3])
+    image[: int(centres[:, 1].min() - radius + 2.0 * radius * share)] = grey
+    ellipses = detect_ellipses(image, CAMERA, CONFIG)
+    predicted = detect_predicted_board(ellipses, BOARD, CAMERA, pose)
+    assert predicted is not None
+    for each in (*detect_boards(ellipses, [BOARD], CAMERA), predicted):
+        assert len(each.indices) >= 3
+        error = np.linalg.norm(each.centres - centres[each.indices], axis=1)
+        assert error.max() < PARTLY_HIDDEN
 
 
 def test_no_ellipses_in_flat_and_noisy_images():
