@@ -21,6 +21,7 @@ from rich.progress import track
 
 from sitegen.field import build_field
 from sitegen.lab import build_lab
+from sitegen.levels import build_levels
 from sitegen.night import second_night
 from sitegen.rack import build_rack
 from sitegen.recording import (
@@ -58,10 +59,16 @@ class Layout(str, Enum):
 
     lab = "lab"
     field = "field"
+    levels = "levels"
     rack = "rack"
 
 
-_BUILDERS = {Layout.lab: build_lab, Layout.field: build_field, Layout.rack: build_rack}
+_BUILDERS = {
+    Layout.lab: build_lab,
+    Layout.field: build_field,
+    Layout.levels: build_levels,
+    Layout.rack: build_rack,
+}
 
 
 class Size(str, Enum):
@@ -76,12 +83,14 @@ class Size(str, Enum):
 
 @app.command()
 def make_site(
-    layout: Annotated[Layout, typer.Argument(help="lab: 6 pipes in a corner; field: 58; rack: of many materials")],
+    layout: Annotated[
+        Layout, typer.Argument(help="lab: 6 pipes in a corner; field: 58; levels: in line; rack: of many materials")
+    ],
     out: Annotated[Path, typer.Argument(help="NAME.mcap; NAME.truth.json, .boq.yaml and .board.yaml go beside it")],
     seed: Annotated[int, typer.Option(help="layout, textures, hand and noise")] = 1,
     size: Annotated[Size, typer.Option(help="image size")] = Size.p720,
     fps: Annotated[float, typer.Option(help="frames per second", min=0.1)] = 5.0,
-    seconds: Annotated[float | None, typer.Option(help="duration; field: the whole walk, else 16")] = None,
+    seconds: Annotated[float | None, typer.Option(help="duration; field, levels: the whole walk, else 16")] = None,
     speed: Annotated[float, typer.Option(help="walking speed, m/s", min=0.01)] = 0.75,
     distance: Annotated[float, typer.Option(help="from the wall, m", min=0.5, max=4.0)] = 2.0,
     wobble: Annotated[float, typer.Option(help="unsteadiness of the hand: 0 a rail, 1 a careful person", min=0)] = 1.0,
@@ -127,7 +136,7 @@ def make_site(
     scene = build_scene(site.primitives, site.lamps, site.ambient, seed, site.ambient_colour)
     walk = Walk(site.waypoints, speed, rng, site.closed_walk, wobble)
     if seconds is None:
-        seconds = walk.duration if layout == Layout.field else _LAB_SECONDS
+        seconds = walk.duration if layout in (Layout.field, Layout.levels) else _LAB_SECONDS
     times = np.arange(max(math.floor(seconds * fps), 1)) / fps
     mounts = [mounted(number, turned) for number in range(rig)]
     walks = [MountedWalk(walk, mount) for mount in mounts]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sitegen.primitives import Material, bend_tangent, unit
-from sitegen.render import Lens, build_scene
 from sitegen.site import (
     BEND,
     CABLE,
@@ -25,8 +24,7 @@ from sitegen.site import (
     Site,
     segment_gap,
 )
-from sitegen.visibility import coverage
-from sitegen.walk import Walk
+from sitegen.visibility import shows_every_pipe
 
 FloatArray = NDArray[np.float64]
 
@@ -36,7 +34,6 @@ _LAYOUTS = 40  # layouts drawn until one shows every pipe
 _PLACINGS = 6000  # attempts to place the pipes of a layout
 _RACK_DEPTH = -1.95  # m; further from the wall the path would be below the ceiling rack
 _GAP = 0.025  # metres of air between pipes that were not installed side by side
-_PROBE = Lens(214, 120, 153.0, 153.0, 106.5, 59.5)
 
 
 class _Room:
@@ -285,9 +282,6 @@ def build_field(
         site.ambient = 0.40
         site.gain = 1.0
         site.waypoints = _waypoints(distance)
-        walk = Walk(site.waypoints, 1.0, np.random.default_rng(0), False, 0.0)
-        scene = build_scene(site.primitives, site.lamps, site.ambient, 0)
-        poses = walk.poses(np.arange(0.0, walk.duration, 0.3))
-        if all(seen.enough for seen in coverage(scene, site.pipes, _PROBE, poses)):
+        if shows_every_pipe(site):
             return site
     raise RuntimeError(f"no layout in {_LAYOUTS} shows every pipe: choose another seed")

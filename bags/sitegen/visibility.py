@@ -9,14 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sitegen.render import Lens, Scene, trace
-from sitegen.site import Pipe
+from sitegen.render import Lens, Scene, build_scene, trace
+from sitegen.site import Pipe, Site
+from sitegen.walk import Walk
 
 FloatArray = NDArray[np.float64]
 
 _STEP = 0.02  # m, length of a bin along a pipe
 _MIN_FRAMES = 3  # two views give a depth, a third confirms it
 _MIN_SHARE = 0.6  # of the length: a pipe is then longer than its gaps
+_PROBE = Lens(214, 120, 153.0, 153.0, 106.5, 59.5)
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,14 @@ def coverage(scene: Scene, pipes: Sequence[Pipe], lens: Lens, poses: FloatArray)
             bins[index][seen] += 1
             frames[index] += 1
     return [Coverage(int(n), float(np.mean(b >= _MIN_FRAMES))) for n, b in zip(frames, bins, strict=True)]
+
+
+def shows_every_pipe(site: Site) -> bool:
+    """Whether a steady walk along the site's waypoints shows enough of each of its pipes."""
+    walk = Walk(site.waypoints, 1.0, np.random.default_rng(0), False, 0.0)
+    scene = build_scene(site.primitives, site.lamps, site.ambient, 0)
+    poses = walk.poses(np.arange(0.0, walk.duration, 0.3))
+    return all(seen.enough for seen in coverage(scene, site.pipes, _PROBE, poses))
 
 
 def visible_surface(scene: Scene, lens: Lens, poses: FloatArray) -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -6,6 +6,7 @@ import pytest
 
 from sitegen.field import build_field
 from sitegen.lab import build_lab
+from sitegen.levels import build_levels
 from sitegen.render import Lens, build_scene
 from sitegen.site import BOARD_CENTRES, FIELD_RADII, LAB_RADII, Site, segment_gap
 from sitegen.visibility import coverage, visible_surface
@@ -54,6 +55,24 @@ def test_field_has_58_pipes_of_six_radii_in_racks_chains_and_alone() -> None:
     assert len(site.boards) == 2
     assert sum("elbow" in p.ends for p in site.pipes) >= 2
     assert_apart(site)
+
+
+def test_levels_have_pipes_in_line_of_sizes_and_axes_that_may_be_nearly_alike() -> None:
+    site = build_levels(np.random.default_rng(1), 1.0, 0.0, 2.0)
+    assert len(site.boards) == 2
+    level = [pipe for pipe in site.pipes if pipe.start[2] == pipe.end[2]]
+    in_line = [
+        (one, other)
+        for one, other in combinations(level, 2)
+        if abs(one.start[2] - other.start[2]) < 0.05 and 0.1 < other.start[0] - one.end[0] < 0.5
+    ]
+    for one, other in combinations(site.pipes, 2):
+        beside = segment_gap(one.start, one.end, other.start, other.end) > one.radius + other.radius
+        assert beside or any(one is a and other is b for a, b in in_line)
+    assert len(in_line) > 20
+    assert any(1.0 < max(a.radius, b.radius) / min(a.radius, b.radius) < 1.25 for a, b in in_line)
+    assert any(a.radius == b.radius for a, b in in_line)
+    assert len(site.pipes) - len(level) > 8, "risers"
 
 
 def test_boards_face_the_room_with_their_first_circle_up_left() -> None:
