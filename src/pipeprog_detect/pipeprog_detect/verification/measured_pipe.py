@@ -82,9 +82,9 @@ def joined(
 ) -> list[MeasuredPipe]:
     """The pipes with collinear pieces joined; the radius is that of the piece with the least standard deviation.
 
-    Pieces of two radii are two pipes, and so are those between which the views see what is behind them, or a wall of
-    the `context` closes around the axis. Only those that lie within each other are joined where `overlapping` is asked
-    for.
+    Pieces of two radii, or of two axes by their contours, are two pipes, and so are those between which the views see
+    what is behind them, or a wall of the `context` closes around the axis. Only those that lie within each other are
+    joined where `overlapping` is asked for.
     """
     whole = []
     for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views, overlapping, context):
