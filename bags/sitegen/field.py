@@ -15,13 +15,10 @@ from sitegen.site import (
     CABLE,
     CARDBOARD,
     CONCRETE,
-    COPPER,
     FIELD_RADII,
     GALVANISED,
-    PIPE_MATERIALS,
-    PLASTER,
-    SCREED,
     Site,
+    drawn_material,
     segment_gap,
 )
 from sitegen.visibility import shows_every_pipe
@@ -53,7 +50,7 @@ class _Room:
         return self.pool[int(self.rng.integers(len(self.pool)))]
 
     def material(self, radius: float) -> Material:
-        return COPPER if radius < 0.02 else PIPE_MATERIALS[int(self.rng.integers(len(PIPE_MATERIALS)))]
+        return drawn_material(self.rng, radius)
 
     def block(self, low: ArrayLike, high: ArrayLike, material: Material | None = None, yaw: float = 0.0) -> None:
         """Clutter that pipes keep clear of; without material a space that is to stay empty."""
@@ -110,14 +107,7 @@ class _Room:
 
 def _shell(room: _Room) -> None:
     site = room.site
-    half = _WIDTH / 2
-    site.wall((half, 0.0, _HEIGHT / 2), (0, -1, 0), _WIDTH, _HEIGHT, CONCRETE)
-    site.wall((half, -_DEPTH, _HEIGHT / 2), (0, 1, 0), _WIDTH, _HEIGHT, PLASTER)
-    site.wall((0.0, -_DEPTH / 2, _HEIGHT / 2), (1, 0, 0), _DEPTH, _HEIGHT, PLASTER)
-    site.wall((_WIDTH, -_DEPTH / 2, _HEIGHT / 2), (-1, 0, 0), _DEPTH, _HEIGHT, PLASTER)
-    site.wall((half, -_DEPTH / 2, 0.0), (0, 0, 1), _WIDTH, _DEPTH, SCREED)
-    site.wall((half, -_DEPTH / 2, _HEIGHT), (0, 0, -1), _WIDTH, _DEPTH, CONCRETE)
-
+    site.room(_WIDTH, _HEIGHT, _DEPTH)
     room.block((0.2, -0.32, 2.80), (_WIDTH - 0.3, -0.03, 3.08), GALVANISED)  # duct
     low = 2.36  # cable tray: floor, two flanks, and cables of several layers in it
     room.block((0.2, -0.27, low), (_WIDTH - 0.3, -0.02, low + 0.003), GALVANISED)

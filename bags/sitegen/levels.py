@@ -11,13 +11,12 @@ import math
 
 import numpy as np
 
-from sitegen.primitives import Material
-from sitegen.site import CARDBOARD, CONCRETE, COPPER, FIELD_RADII, GALVANISED, PIPE_MATERIALS, PLASTER, SCREED, Site
+from sitegen.site import CARDBOARD, CONCRETE, FIELD_RADII, GALVANISED, Site, drawn_material
 from sitegen.visibility import shows_every_pipe
 
 _WIDTH, _HEIGHT, _DEPTH = 10.0, 3.6, 5.5
 _LAYOUTS = 40  # layouts drawn until one shows every pipe
-# Heights of the axes [m]: two of the thickest pipes side by side have 2 cm of air between them.
+# Heights of the axes [m]: two of the thickest pipes side by side have 7 cm of air between them.
 _LOWEST, _STEP, _LEVELS, _JITTER = 0.42, 0.36, 8, 0.02
 _FIRST, _LAST = 0.95, 9.3  # m along the wall, between which pipes lie
 _RISERS = 18
@@ -32,7 +31,7 @@ def build_levels(
     """Wall y = 0 with everything before it (y < 0), floor z = 0; raises RuntimeError where no layout is seen."""
     for _ in range(_LAYOUTS):
         site = Site(FIELD_RADII, richness, wall_period, board_error)
-        _shell(site)
+        site.room(_WIDTH, _HEIGHT, _DEPTH)
         for level in range(_LEVELS):
             _in_line(site, rng, _LOWEST + level * _STEP)
         _before_them(site, rng)
@@ -47,20 +46,6 @@ def build_levels(
     raise RuntimeError(f"no layout in {_LAYOUTS} shows every pipe: choose another seed")
 
 
-def _shell(site: Site) -> None:
-    half = _WIDTH / 2
-    site.wall((half, 0.0, _HEIGHT / 2), (0, -1, 0), _WIDTH, _HEIGHT, CONCRETE)
-    site.wall((half, -_DEPTH, _HEIGHT / 2), (0, 1, 0), _WIDTH, _HEIGHT, PLASTER)
-    site.wall((0.0, -_DEPTH / 2, _HEIGHT / 2), (1, 0, 0), _DEPTH, _HEIGHT, PLASTER)
-    site.wall((_WIDTH, -_DEPTH / 2, _HEIGHT / 2), (-1, 0, 0), _DEPTH, _HEIGHT, PLASTER)
-    site.wall((half, -_DEPTH / 2, 0.0), (0, 0, 1), _WIDTH, _DEPTH, SCREED)
-    site.wall((half, -_DEPTH / 2, _HEIGHT), (0, 0, -1), _WIDTH, _DEPTH, CONCRETE)
-
-
-def _material(rng: np.random.Generator, radius: float) -> Material:
-    return COPPER if radius < 0.02 else PIPE_MATERIALS[int(rng.integers(len(PIPE_MATERIALS)))]
-
-
 def _in_line(site: Site, rng: np.random.Generator, height: float) -> None:
     """Pipes along the wall at one height, with a gap between each two."""
     x = _FIRST + rng.uniform(0.0, 0.2)
@@ -68,7 +53,7 @@ def _in_line(site: Site, rng: np.random.Generator, height: float) -> None:
         radius = float(rng.choice(FIELD_RADII))
         end = min(x + rng.uniform(0.8, 2.3), _LAST)
         y, z = -(radius + rng.uniform(0.03, 0.14)), height + rng.uniform(-_JITTER, _JITTER)
-        pipe = site.pipe((x, y, z), (end, y, z), radius, _material(rng, radius), ("free", "free"))
+        pipe = site.pipe((x, y, z), (end, y, z), radius, drawn_material(rng, radius), ("free", "free"))
         for share in (rng.uniform(0.12, 0.3), rng.uniform(0.7, 0.88)):
             site.clamp(pipe, share * (end - x), (0, 1, 0), -y)
         x = end + rng.uniform(0.12, 0.45)
@@ -96,7 +81,7 @@ def _before_them(site: Site, rng: np.random.Generator) -> None:
             continue
         foot, y = rng.uniform(0.4, 1.5), -(_BEFORE + radius + rng.uniform(0.0, 0.1))
         top = min(foot + rng.uniform(0.8, 1.6), 3.1)
-        pipe = site.pipe((x, y, foot), (x, y, top), radius, _material(rng, radius), ("free", "free"))
+        pipe = site.pipe((x, y, foot), (x, y, top), radius, drawn_material(rng, radius), ("free", "free"))
         site.clamp(pipe, rng.uniform(0.2, 0.8) * (top - foot), (0, 1, 0), -y)
     for _ in range(3):
         x, width, height = rng.uniform(1.5, 8.0), rng.uniform(0.25, 0.5), rng.uniform(0.15, 0.3)

@@ -62,6 +62,11 @@ COPPER = Material(
 )
 
 
+def drawn_material(rng: np.random.Generator, radius: float) -> Material:
+    """What a pipe of this radius [m] is made of: the thinnest ones are copper."""
+    return COPPER if radius < 0.02 else PIPE_MATERIALS[int(rng.integers(len(PIPE_MATERIALS)))]
+
+
 @dataclass(frozen=True)
 class Pipe:
     """A true straight barrel; `ends` says what each end is: free, elbow, floor or wall."""
@@ -116,6 +121,16 @@ class Site:
     def wall(self, centre: ArrayLike, normal: ArrayLike, width: float, height: float, material: Material) -> None:
         """A wall, floor or ceiling, its texture tiled where the site asks for that."""
         self.add(shapes.rectangle(centre, normal, width, height, self.dressed(material, wall=True)))
+
+    def room(self, width: float, height: float, depth: float) -> None:
+        """A room from the back wall y = 0 towards -y, from x = 0 on, with its floor at z = 0."""
+        half, middle = width / 2, -depth / 2
+        self.wall((half, 0.0, height / 2), (0, -1, 0), width, height, CONCRETE)
+        self.wall((half, -depth, height / 2), (0, 1, 0), width, height, PLASTER)
+        self.wall((0.0, middle, height / 2), (1, 0, 0), depth, height, PLASTER)
+        self.wall((width, middle, height / 2), (-1, 0, 0), depth, height, PLASTER)
+        self.wall((half, middle, 0.0), (0, 0, 1), width, depth, SCREED)
+        self.wall((half, middle, height), (0, 0, -1), width, depth, CONCRETE)
 
     def box(self, low: ArrayLike, high: ArrayLike, material: Material, yaw: float = 0.0) -> None:
         """A box between two corners."""
