@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.outside_text import for_terminal
+from pipeprog_node.processes.freed_memory import give_back_large_blocks
 from pipeprog_node.renewal import MakeNode, RenewableNode
 
 STOP_LATENCY = 0.1  # [s] at most from a signal to the end of a node to which no message comes
@@ -26,6 +27,7 @@ def run(node_type: MakeNode, renewed: Collection[str] = ()) -> None:
 
     The process exits with 0 after SIGINT or SIGTERM, and with 1 and one line on stderr after an InputError.
     """
+    give_back_large_blocks()
     # rclpy's own handlers invalidate the context while the executor enters its wait, which then fails or never ends.
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
