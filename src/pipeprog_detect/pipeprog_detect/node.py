@@ -126,9 +126,15 @@ class MapInput:
         complete = _complete(parts)
         if complete is not None:
             self.revision = max(self.revision, complete.status.revision)
+            self._forget_before(part.stamp)
         while len(self._parts) > MAX_PENDING or (len(self._parts) > 1 and self._points() > MAX_CLOUD_POINTS):
             self._parts.popitem(last=False)
         self._use()
+
+    def _forget_before(self, stamp: int) -> None:
+        """Forgets the maps whose first part came before that of a complete one: it replaces them."""
+        while next(iter(self._parts)) != stamp:
+            self._parts.popitem(last=False)
 
     def _points(self) -> int:
         clouds = [parts[ReceivedCloud] for parts in self._parts.values() if ReceivedCloud in parts]
