@@ -44,6 +44,9 @@ MARGIN = 0.04
 # px, by which changes of the camera may move a point of the image before depth maps are made anew: the one that moves
 # most; the others move by a third of it on average, about what matched patches err by.
 OUTDATED = 0.5
+# Depth maps given up whose points are in the cloud, per depth map held, from which on it is made anew. A place that is
+# seen again and again adds noise on both sides of its surfaces. Each depth map given up costs two fusions more.
+GIVEN_UP = 0.5
 STILL = RowMotion(0.0, 1, np.zeros(3), np.zeros(3))  # all rows at the stamp, however many there are
 
 
@@ -178,7 +181,7 @@ class DenseMapper:
         """The cloud for rigid poses in metres, `scale` metres per unit of the model.
 
         Of all depth maps if complete, else of those that are there. They are added to the last cloud, unless it is to
-        be made anew or the poses have moved by more than a voxel.
+        be made anew, the poses have moved by more than a voxel, or much in it is of depth maps that were given up.
         """
         self._submit(all_of_them=complete)
         maps = {}
@@ -279,7 +282,8 @@ class DenseMapper:
     ) -> FusedCloud:
         poses = {stamp: pose for stamp, (_, pose) in maps.items()}
         moved = [distance(poses[stamp], pose) for stamp, pose in self._fused.items() if stamp in poses]
-        if anew or max(moved, default=0.0) > self._fusion_config.voxel:
+        given_up = len(self._fused) - len(moved)
+        if anew or given_up > GIVEN_UP * len(maps) or max(moved, default=0.0) > self._fusion_config.voxel:
             self._start_anew()
         for stamp, (future, pose) in maps.items():
             if stamp in self._fused or future.cancelled():  # given up since

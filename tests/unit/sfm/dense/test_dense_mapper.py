@@ -10,7 +10,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense import dense_mapper
-from pipeprog_sfm.dense.dense_mapper import OUTDATED, DenseMapper, Registered
+from pipeprog_sfm.dense.dense_mapper import GIVEN_UP, OUTDATED, DenseMapper, Registered
 from pipeprog_sfm.types import EncodedImage
 
 WIDTH, HEIGHT = 240, 160
@@ -93,6 +93,26 @@ def test_a_cloud_is_made_anew_where_the_poses_have_moved_by_more_than_a_voxel(
         matrix[2, 3] -= 0.1  # the cameras are 0.1 m farther on in the map, and so is what they see
     after = dense.fuse(moved, poses, 1.0, complete=True, anew=False).result()
     assert np.median(after.points[:, 2]) - np.median(whole.points[:, 2]) == pytest.approx(0.1, abs=0.002)
+
+
+def test_a_cloud_is_made_anew_where_much_of_it_is_of_depth_maps_given_up() -> None:
+    dense, poses, _ = walk([*range(24)])
+    whole, count = dense.fuse(poses, poses, 1.0, complete=True, anew=True).result(), len(dense)
+    kept = 0
+    for stamp in range(20):
+        del poses[stamp]
+        dense.retire([stamp])
+        after = dense.fuse(poses, poses, 1.0, complete=False, anew=False).result()
+        if count - len(dense) > GIVEN_UP * len(dense):
+            anew = dense.fuse(poses, poses, 1.0, complete=False, anew=True).result()
+            np.testing.assert_array_equal(after.points, anew.points)
+            assert 0 < len(anew.points) < len(whole.points)
+            break
+        np.testing.assert_array_equal(after.points, whole.points)
+        kept += count > len(dense)
+    else:
+        pytest.fail("never made anew")
+    assert kept
 
 
 def test_what_is_seen_again_makes_no_more_depth_maps() -> None:
