@@ -5,7 +5,7 @@
 
 A robot walks along the demo and back, again and again, at its own pace, with ten images of 720p a second (each frame of
 the demo twice). Once a minute the memory is read that each node and its worker hold for themselves, and how many
-keyframes and how large a cloud the map has. Ten times a second each node is asked for a parameter, and for the
+keyframes the map has. Ten times a second each node is asked for a parameter, and for the
 description of it: the longest time between two of its answers is that of its longest callback, or more. (A question
 that the middleware loses holds up those of its kind until it has come again, and looks like a callback where one kind
 is asked alone. In nine minutes of a survey of which that told 1.4 s a sampling profiler saw no callback of more than
@@ -28,7 +28,7 @@ import rclpy
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 from rclpy.client import Client
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage
 
 from benchmarks.live_graph import PATIENCE, LiveGraph, Robot, demo_frames
 from benchmarks.survey import RESULTS, commit
@@ -53,11 +53,10 @@ class Walker(Robot):
         self.decided: dict[int, str] = {}  # reason of the last decision by stamp of the image
         self.slowest = dict.fromkeys(MODULES, 0.0)  # s between two answers
         self.rows: list[dict[str, Any]] = []
-        self._in_map = {"keyframes in the map": 0, "cloud of the map [MB]": 0.0}
+        self._registered = 0
         frames = demo_frames()
         super().__init__(graph, frames)
         self._node.create_subscription(SfmStatus, "sfm_status", self._on_status, qos.latched())
-        self._node.create_subscription(PointCloud2, "map_points", self._on_map, qos.latched(), raw=True)
         there = [
             (deserialize_message(frame.camera_info, CameraInfo), deserialize_message(frame.data, CompressedImage))
             for frame in frames
@@ -88,7 +87,7 @@ class Walker(Robot):
                     "minute": minute,
                     "images": self.sent,
                     "keyframes chosen": self._chosen,
-                    **self._in_map,
+                    "keyframes in the map": self._registered,
                     **{f"{name} [MB]": round(value) for name, value in memory.items()},
                     "all [MB]": round(sum(memory.values())),
                     **self.silences(),
@@ -122,10 +121,7 @@ class Walker(Robot):
         self.sent += 1
 
     def _on_status(self, message: SfmStatus) -> None:
-        self._in_map["keyframes in the map"] = message.keyframes_registered
-
-    def _on_map(self, message: bytes) -> None:
-        self._in_map["cloud of the map [MB]"] = round(len(message) / 1e6, 1)
+        self._registered = message.keyframes_registered
 
     def _on_decision(self, message: FrameDecision) -> None:
         super()._on_decision(message)
