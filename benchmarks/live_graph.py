@@ -46,12 +46,12 @@ PATIENCE = 600.0  # s for what takes a minute on an idle machine
 class LiveGraph:
     """Context in which the four nodes run, each a process that is started again after its death."""
 
-    def __init__(self, folder: Path, settings: dict[str, Any], intermediate: bool = True) -> None:
+    def __init__(self, folder: Path, settings: dict[str, Any], intermediate: bool = True, timed: bool = False) -> None:
         """`folder` takes parameter files, logs and, under `surveys`, the results; `settings`: of sfm.
 
-        Without `intermediate` there is the last map alone, as in a replay.
+        Without `intermediate` there is the last map alone, as in a replay. `timed`: for `longest_turns`.
         """
-        self._folder = folder
+        self._folder, self._timed = folder, timed
         self._parameters: dict[str, dict[str, Any]] = {
             "frames": {"idle": True},
             "sfm": {"map_interval": 4, "intermediate": intermediate, **settings},
@@ -97,11 +97,19 @@ class LiveGraph:
             for name, process in self._processes.items()
         }
 
+    def longest_turns(self) -> dict[str, float]:
+        """Of each node the longest turn of its executor so far, s: a wait of 0.1 s at the most, and a callback."""
+        return {name: float(self._turn_of(name).read_text()) for name in MODULES}
+
+    def _turn_of(self, name: str) -> Path:
+        return self._folder / f"{name}.turn"
+
     def _start(self, name: str) -> None:
         self.starts[name] += 1
         file = self._folder / f"{name}.yaml"
         file.write_text(yaml.safe_dump({name: {"ros__parameters": self._parameters[name]}}))
-        command = [sys.executable, "-m", MODULES[name], "--ros-args", "-r", f"__node:={name}"]
+        timed = ["benchmarks.timed_node", str(self._turn_of(name))] if self._timed else []
+        command = [sys.executable, "-m", *timed, MODULES[name], "--ros-args", "-r", f"__node:={name}"]
         with (self._folder / f"{name}.log").open("ab") as log:
             self._processes[name] = subprocess.Popen(
                 [*command, "--params-file", str(file)], stdout=log, stderr=subprocess.STDOUT
