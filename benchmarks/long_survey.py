@@ -97,8 +97,12 @@ class Walker(Robot):
 
     def times(self) -> dict[str, float]:
         """Of each node so far the longest turn, and the longest time without an answer, s."""
-        turns = {f"longest turn of {name} [s]": round(value, 2) for name, value in self._graph.longest_turns().items()}
-        return turns | {f"longest without an answer of {name} [s]": round(v, 2) for name, v in self.slowest.items()}
+        kinds = {"turn": self._graph.longest_turns(), "without an answer": self.slowest}
+        return {
+            f"longest {kind} of {name} [s]": round(value, 2)
+            for kind, values in kinds.items()
+            for name, value in values.items()
+        }
 
     def _ask(self, name: str, clients: Sequence[Client]) -> None:
         now = time.monotonic()

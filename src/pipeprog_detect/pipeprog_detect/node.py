@@ -107,8 +107,8 @@ class MapInput:
 
     @property
     def newest(self) -> CompleteMap | None:
-        """The complete map whose first part came last."""
-        complete = (_complete(parts) for parts in reversed(self._parts.values()))
+        """The complete map; there is one at the most, since it replaces those before it."""
+        complete = map(_complete, self._parts.values())
         return next((parts for parts in complete if parts is not None), None)
 
     def discard(self, taken: CompleteMap) -> None:
