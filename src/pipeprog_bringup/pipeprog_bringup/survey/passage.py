@@ -146,12 +146,14 @@ class Passage:
         return maps.newest
 
     async def rest(self) -> None:
-        """Lets the nodes forget this survey and take no images."""
-        self._begun.clear()
-        await self._renewed("frames", idle=True)
+        """Lets the nodes forget this survey and take no images; one that is still starting has nothing to forget."""
+        begun, self._begun = self._begun, {}
+        if "frames" in begun or self._is_there("frames"):
+            await self._renewed("frames", idle=True)
         self.pause(False)
-        await self._renewed("sfm")
-        await self._renewed("detect")
+        for name in ("sfm", "detect"):
+            if name in begun or self._is_there(name):
+                await self._renewed(name)
 
     async def settings(self) -> dict[str, Any]:
         """The settings of each node, as config.yaml has them."""

@@ -22,7 +22,7 @@ from pipeprog_bringup.playback.frame_log import LiveFrameLog
 from pipeprog_bringup.results.result_files import FrameRow
 from pipeprog_bringup.survey import passage as passages
 from pipeprog_bringup.survey.goal import Goal, read_site
-from pipeprog_bringup.survey.passage import MAX_RESTARTS, Passage, SurveyFailure
+from pipeprog_bringup.survey.passage import MAX_RESTARTS, Cancelled, Passage, SurveyFailure
 from pipeprog_frames.frame_decision import UNCALIBRATED
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import SfmStatus
@@ -45,7 +45,8 @@ class Stage:
             self._executor.add_node(node)
         self._waiting: list[Future] = []
         self._listener.create_timer(TICK, self._wake)
-        self.passage = Passage(self._listener, self._tick, lambda: False, LiveFrameLog())
+        self.is_cancelled = False
+        self.passage = Passage(self._listener, self._tick, lambda: self.is_cancelled, LiveFrameLog())
 
     def start(self, coroutine: Any) -> Any:
         return self._executor.create_task(coroutine)
@@ -58,9 +59,12 @@ class Stage:
         return task.result()
 
     def begin(self, folder: Path) -> None:
-        site = read_site(str(BAGS / "demo.boq.yaml"), "")
-        self.run(self.passage.begin(Goal("survey", site, 0.0), folder / "colmap", folder / "journal"))
+        self.run(self.beginning(folder))
         self.graph.asked.clear()
+
+    def beginning(self, folder: Path) -> Any:
+        site = read_site(str(BAGS / "demo.boq.yaml"), "")
+        return self.passage.begin(Goal("survey", site, 0.0), folder / "colmap", folder / "journal")
 
     def spin_until(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + TIMEOUT
@@ -117,9 +121,7 @@ def test_a_node_that_dies_takes_the_survey_up_and_is_asked_again(stage: Stage, t
 
 def test_a_node_that_dies_before_it_was_heard_begins_once_it_is_there_again(stage: Stage, tmp_path: Path) -> None:
     stage.graph.is_silent, stage.graph.dying = True, ["frames"]
-    site = read_site(str(BAGS / "demo.boq.yaml"), "")
-    goal = Goal("survey", site, 0.0)
-    begun = stage.start(stage.passage.begin(goal, tmp_path / "colmap", tmp_path / "journal"))
+    begun = stage.start(stage.beginning(tmp_path))
     stage.spin_until(lambda: stage.graph.is_found)
     stage.graph.is_silent = False  # one that is asked before this dies unnoticed
     stage.spin_until(begun.done)
@@ -215,6 +217,29 @@ def test_a_node_that_is_not_there_ends_the_survey(
     with pytest.raises(SurveyFailure, match="the node frames is not there") as failure:
         stage.begin(tmp_path)
     assert failure.value.code == Survey.Result.TIMEOUT
+
+
+def test_a_cancelled_survey_does_not_wait_for_a_node_that_is_still_starting(stage: Stage, tmp_path: Path) -> None:
+    stage.graph.leave("sfm")
+    beginning = stage.start(stage.beginning(tmp_path))
+    stage.spin_until(lambda: ("detect", "renew", False, "journal") in stage.graph.asked)
+    stage.is_cancelled = True
+    with pytest.raises(Cancelled):
+        stage.spin_until(beginning.done)
+    stage.is_cancelled = False  # it is obeyed
+    stage.graph.asked.clear()
+    stage.run(stage.passage.rest())
+    assert stage.graph.asked == [("frames", "renew", True, ""), ("detect", "renew", False, "")]
+
+
+def test_a_survey_that_is_over_waits_for_a_node_that_has_begun_it(
+    stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage.begin(tmp_path)
+    stage.graph.leave("sfm")
+    monkeypatch.setattr(passages, "DELIVERY_SECONDS", 10 * TICK)
+    with pytest.raises(SurveyFailure, match="the node sfm is not there"):
+        stage.run(stage.passage.rest())
 
 
 def test_nodes_that_do_not_find_each_other_end_the_survey(
