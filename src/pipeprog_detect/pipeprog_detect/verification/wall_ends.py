@@ -102,6 +102,8 @@ def _goes_on(
         total = np.append(0.0, np.cumsum(evidence.log_odds[beyond]))
         place = np.append(0.0, evidence.along[beyond])
     rate = 1.0 / cylinder.length
-    ends_here = total - rate * place + np.log(-np.expm1(-rate * ahead / len(place)))
+    # An end is as probable, before what is seen, as the stretch about its place is long: the last one goes to the plane.
+    parts = np.concatenate([[0.0], 0.5 * (place[1:] + place[:-1]), [ahead]])
+    ends_here = total - rate * parts[:-1] + np.log(-np.expm1(-rate * np.diff(parts)))
     ends_here[0] += rim
     return bool(total[-1] - rate * ahead > np.logaddexp.reduce(ends_here))

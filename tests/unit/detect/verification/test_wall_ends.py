@@ -9,8 +9,10 @@ import pytest
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.refinement.axial_evidence import AxialEvidence
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification import wall_ends
 from pipeprog_detect.verification.scene_context import SceneContext
 from pipeprog_detect.verification.wall_ends import with_ends_on_walls
 from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
@@ -90,6 +92,16 @@ def test_nothing_goes_on_to_a_plane_that_is_not_there_or_runs_along(pipe_views: 
     wall = walls(Plane(np.array([0.0, 1.0, 0.0]), 0.05, 1.44), points)
     along = with_ends_on_walls(PIPE, NO_RIMS, wall, pipe_views, [])
     assert along.length == pytest.approx(PIPE.length, abs=1e-9)
+
+
+def test_one_centimetre_that_is_seen_tells_little_of_a_hidden_stretch(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two to one against the pipe there; that it ends in that centimetre was improbable before."""
+    seen = AxialEvidence(np.array([0.01]), np.array([-np.log(2.0)]), np.array([2.0]))
+    monkeypatch.setattr(wall_ends, "axial_evidence", lambda *_: seen)
+    longer = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.25), pipe_views, [])
+    assert height_of_start(longer) == pytest.approx(-0.25, abs=TOLERANCE)
 
 
 @pytest.mark.parametrize("below", [0.08, 0.9])
