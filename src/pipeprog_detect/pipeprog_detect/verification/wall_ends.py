@@ -33,6 +33,7 @@ def with_ends_on_walls(
     Prior: ends occur along a pipe as a Poisson process with one end per measured length. Where the keyframes do not
     show that the pipe stops before a plane, it is the more probable that it goes on to the plane the nearer that is.
     Where they see through what is between, the edges there are of something else in line with the pipe.
+    Where no keyframe looks the floor, the ceiling and the walls of the room go on; other planes end.
     A part that lies behind a plane as seen from every camera, and that the plane surrounds, was not seen: it is cut.
 
     Args:
@@ -75,9 +76,11 @@ def _distance(
     # Half of the ends lie within ln 2 of the mean distance between them; of what a plane hides a radius is left.
     if distance is None or not cylinder.radius - cylinder.length < distance < np.log(2.0) * cylinder.length:
         return None
-    offset = points_on(plane.normal, end + distance * out, context)
+    place = end + distance * out
+    offset = points_on(plane.normal, place, context)
     if len(offset) < LEAST_POINTS:
-        return None
+        is_unseen = bool(views) and not views_showing(place[None], views, 1)
+        return distance if distance > 0.0 and is_unseen and context.bounds_room(plane, out) else None
     if distance < 0.0:
         before = float(plane.normal @ out)
         seen_from = [before * float(plane.offset - plane.normal @ view.centre) for view in views]

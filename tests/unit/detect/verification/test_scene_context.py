@@ -162,3 +162,12 @@ def test_the_rounding_of_a_corner_is_one_of_planes_that_are_seen_beside_it(
     around = SceneContext(octree.build(surface), None, [back, side], walls, SIGMA)
     evidence = CloudEvidence(arc=0.5 * np.pi, coverage=1.0, inside=0.0, noise=SIGMA, roundness=0.0, flatness=100.0)
     assert around.rejects(Candidate(rounding, 1e-3, len(surface), evidence)) is rejected
+
+
+def test_a_wall_bounds_the_room_where_next_to_nothing_is_seen_behind_it() -> None:
+    board = BACK[BACK[:, 2] < 0.5] - 0.3 * AWAY
+    far, near = Plane(AWAY, 0.0, 1.0), Plane(-AWAY, 0.3, 0.51)
+    around = surroundings(BACK, board, planes=[far, near])
+    assert around.bounds_room(far, AWAY)  # one point behind it is astray
+    assert not around.bounds_room(far, -AWAY)
+    assert not around.bounds_room(near, AWAY)

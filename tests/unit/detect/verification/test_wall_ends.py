@@ -10,6 +10,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud import octree
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.refinement.axial_evidence import AxialEvidence
+from pipeprog_detect.silhouette.apparent_contour import in_image
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification import wall_ends
@@ -102,6 +103,22 @@ def test_one_centimetre_that_is_seen_tells_little_of_a_hidden_stretch(
     monkeypatch.setattr(wall_ends, "axial_evidence", lambda *_: seen)
     longer = with_ends_on_walls(cut(0.1), NO_RIMS, floor(-0.25), pipe_views, [])
     assert height_of_start(longer) == pytest.approx(-0.25, abs=TOLERANCE)
+
+
+@pytest.mark.parametrize(("beyond", "end"), [(None, -1.0), (-1.3, -0.55)])
+def test_a_pipe_that_leaves_the_images_goes_on_to_the_floor_of_the_room(
+    pipe_views: list[View], beyond: float | None, end: float
+) -> None:
+    """Of the floor a part elsewhere is seen; what has a floor under it, too, is a platform and ends somewhere."""
+    pipe = Cylinder(np.array([0.0, 0.0, -0.55]), np.array([0.0, 0.0, 0.6]), 0.04)
+    assert not any(in_image(view, np.array([[0.0, 0.0, -1.0]])).any() for view in pipe_views)
+    seen = floor(-1.0, x_from=1.0)
+    if beyond is not None:
+        points = np.concatenate([seen.walls.points, floor(beyond, x_from=2.0).walls.points])
+        seen = walls(seen.planes[0], points)
+    same_or_longer = with_ends_on_walls(pipe, NO_RIMS, seen, pipe_views, [])
+    assert height_of_start(same_or_longer) == pytest.approx(end, abs=TOLERANCE)
+    assert same_or_longer.end[2] == pytest.approx(0.6, abs=1e-9)
 
 
 @pytest.mark.parametrize("below", [0.08, 0.9])
