@@ -12,7 +12,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_detect.types import Cylinder, View
-from tests.unit.detect.pipe_and_wall import PIPE, WALL
+from tests.unit.detect.pipe_and_wall import PIPE, WALL, barrel_depth
 
 SAMPLES = 2
 # Seen from the camera, 30 ms from the first row to the last: 6 px sideways at the pipe, 2 px of turn, 1 px of roll.
@@ -63,16 +63,10 @@ def _render(
     in_shadow = (on_wall[..., 0] > shadow_at) & (on_wall[..., 0] < shadow_at + 0.08)
     light = np.where(in_shadow, 0.25 * light, light)
     if cylinder is not None:
-        axis = cylinder.axis
-        offset = centre - cylinder.start
-        across = rays - (rays @ axis)[..., None] * axis
-        offset_across = offset - (offset @ axis)[..., None] * axis
-        a, b = (across**2).sum(-1), (across * offset_across).sum(-1)
-        root = b**2 - a * ((offset_across**2).sum(-1) - cylinder.radius**2)
-        depth = (-b - np.sqrt(np.maximum(root, 0.0))) / a
-        along = offset @ axis + depth * (rays @ axis)
-        hit = (root > 0) & (along > 0) & (along < cylinder.length)
-        normal = (offset_across + depth[..., None] * across) / cylinder.radius
+        depth = barrel_depth(cylinder, centre, rays)
+        hit = np.isfinite(depth)
+        offset = centre - cylinder.start + np.where(hit, depth, 0.0)[..., None] * rays
+        normal = (offset - (offset @ cylinder.axis)[..., None] * cylinder.axis) / cylinder.radius
         lamp = np.array([-0.5, -0.8, 0.3]) / np.linalg.norm([0.5, 0.8, 0.3])
         light = np.where(hit, 0.08 + 0.12 * np.clip(normal @ lamp, 0.0, None), light)
     light = light.reshape(camera.height, SAMPLES, camera.width, SAMPLES).mean(axis=(1, 3))

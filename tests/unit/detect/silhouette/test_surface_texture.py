@@ -17,7 +17,7 @@ from pipeprog_detect.silhouette.free_space import REFUTED, free_stretches
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.surface_texture import face_log_odds
 from pipeprog_detect.types import Cylinder, View
-from tests.unit.detect.pipe_and_wall import front_points
+from tests.unit.detect.pipe_and_wall import barrel_depth, front_points
 from tests.unit.detect.straight_ahead import looking_along_y
 
 CONTRAST, LEVEL = 25.0, 128.0  # grey levels: of the texture, and around what
@@ -46,11 +46,7 @@ def views(pipe: Cylinder | None, wall: float, count: int = 5, seed: int = 0, slo
         centre = view.centre
         depth = (wall + slope * centre[0] - centre[1]) / (rays[..., 1] - slope * rays[..., 0])
         if pipe is not None:
-            offset, across = pipe.from_axis(centre[None])[0], rays - (rays @ pipe.axis)[..., None] * pipe.axis
-            a, b, c = (across**2).sum(-1), across @ offset, offset @ offset - pipe.radius**2
-            near = (-b - np.sqrt(np.maximum(b**2 - a * c, 0.0))) / a
-            along = pipe.along(centre + near[..., None] * rays)
-            depth = np.where((b**2 > a * c) & (along > 0.0) & (along < pipe.length), near, depth)
+            depth = np.minimum(depth, barrel_depth(pipe, centre, rays))
         image = texture(centre + depth[..., None] * rays, seed)
         image = cv2.GaussianBlur(image, (0, 0), 0.6) + np.random.default_rng(stamp).normal(0.0, 2.0, image.shape)
         shown.append(replace(view, image=np.clip(np.round(image), 0, 255).astype(np.uint8)))
