@@ -105,7 +105,7 @@ def _goes_on(
         total = np.append(0.0, np.cumsum(evidence.log_odds[beyond]))
         place = np.append(0.0, evidence.along[beyond])
     rate = 1.0 / cylinder.length
-    # An end is as probable, before what is seen, as the stretch about its place is long: the last one goes to the plane.
+    # Before anything is seen an end is as probable as its stretch is long: the last stretch goes on to the plane.
     parts = np.concatenate([[0.0], 0.5 * (place[1:] + place[:-1]), [ahead]])
     ends_here = total - rate * parts[:-1] + np.log(-np.expm1(-rate * np.diff(parts)))
     ends_here[0] += rim
