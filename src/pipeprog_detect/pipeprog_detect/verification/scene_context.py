@@ -185,16 +185,22 @@ class SceneContext:
 
         Then it is the floor, the ceiling or a wall of the room.
         """
-        before, behind = next(shares for each, shares in zip(self.planes, self._beside, strict=True) if each is plane)
-        beyond = behind if plane.normal @ direction > 0.0 else before
-        return plane.area > _BOUNDARY and beyond < _STRAY
+        return any(
+            plane is wide and (behind if plane.normal @ direction > 0.0 else before) < _STRAY
+            for wide, before, behind in self._off_wide_planes
+        )
 
     @cached_property
-    def _beside(self) -> list[tuple[float, float]]:
-        """Shares of all points that lie against each plane's normal, and along it, off the plane."""
-        points = np.concatenate([self.tree.points, self.walls.points])
-        away = (points @ plane.normal - plane.offset for plane in self.planes)
-        return [(float(np.mean(each < -_BEHIND)), float(np.mean(each > _BEHIND))) for each in away]
+    def _off_wide_planes(self) -> list[tuple[Plane, float, float]]:
+        """Planes as wide as those of a room, and the shares of all points off them, against and along the normal."""
+        shares = []
+        for plane in self.planes:
+            if plane.area > _BOUNDARY:
+                away = [tree.points @ plane.normal - plane.offset for tree in (self.tree, self.walls)]
+                count = sum(len(each) for each in away)
+                before, behind = (sum(int((sign * each > _BEHIND).sum()) for each in away) for sign in (-1.0, 1.0))
+                shares.append((plane, before / count, behind / count))
+        return shares
 
     @property
     def clearance(self) -> float:
