@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a view with a rolling shutter moves by its own rows: the velocity that fits its features beside known points."""
+"""How a view with a rolling shutter moves by its own rows: what fits its features beside known points best."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeprog_sfm.model.bundle_adjustment import RAYLEIGH_MEDIAN, rotation_from_
 
 MAX_STEPS = 10  # of Gauss-Newton: it converges in three to six
 CONVERGED = 0.01  # px, root mean square of a step over the points, a thirtieth of their noise
-MIN_POINTS = 50  # of a view, from which its own rows tell its velocity: twelve unknowns, and some wrong points
+MIN_POINTS = 50  # of a view, from which its own rows tell its motion: up to eighteen unknowns, and some wrong points
 
 
 @dataclass(frozen=True)
@@ -22,23 +22,19 @@ class RowFit:
     """The motion that fits a view's rows best, with another one as the prior.
 
     Attributes:
-        prior: motion expected.
-        moved: (6,) by how much the one that fits differs, angular (rad/s) and linear (units of the model per second).
+        motion: the one that fits.
+        moved: (6,) by how much its velocities differ from the prior's, angular (rad/s) and linear (units of the model
+            per second).
         information: (6, 6) of the rows on these.
         precision: (6,) of the prior, for a standard deviation of one.
         sigma: the prior's standard deviation, rad/s, and depths of the scene per second.
     """
 
-    prior: RowMotion
+    motion: RowMotion
     moved: FloatArray
     information: FloatArray
     precision: FloatArray
     sigma: float
-
-    @property
-    def motion(self) -> RowMotion:
-        """The one that fits."""
-        return _changed(self.prior, self.moved)
 
     @property
     def sigmas(self) -> FloatArray:
@@ -47,20 +43,32 @@ class RowFit:
             return np.full(6, np.inf)
         return np.sqrt(np.diag(np.linalg.pinv(self.information)))
 
-    def held_to(self, sigma: float) -> RowMotion:
-        """The one that fits best with another standard deviation of the prior."""
-        wide, narrow = (self.information + np.diag(self.precision / each**2) for each in (self.sigma, sigma))
-        return _changed(self.prior, np.asarray(np.linalg.solve(narrow, wide @ self.moved), np.float64))
+    @property
+    def posterior(self) -> FloatArray:
+        """(6, 6) information of rows and prior on the velocities."""
+        return self.information + np.diag(self.precision / self.sigma**2)
+
+    def changed(self, by: FloatArray) -> RowMotion:
+        """The motion with velocities that differ by (6,) from those of the prior."""
+        change = by - self.moved
+        return replace(self.motion, angular=self.motion.angular + change[:3], linear=self.motion.linear + change[3:])
 
 
 def fit_rows(
-    inside: FloatArray, keyframe: Keyframe, features: IntArray, noise: float, prior: RowMotion, sigma: float
+    inside: FloatArray,
+    keyframe: Keyframe,
+    features: IntArray,
+    noise: float,
+    prior: RowMotion,
+    sigma: float,
+    bend_sigmas: FloatArray | None = None,
 ) -> RowFit:
     """The motion that fits a view's points best, with another one as the prior and the pose as it may be.
 
-    Gauss-Newton steps for pose and velocity, twelve unknowns: the columns of the velocity are those of the pose times
-    the row's time. Where the prior is off by much, its rows are too, and count little by their robust weights: one step
-    is not enough. With fewer than MIN_POINTS it is the prior.
+    Gauss-Newton steps for pose, velocity and, with `bend_sigmas`, acceleration: the columns of the velocity are those
+    of the pose times the row's time t, those of the acceleration times t^2 / 2. Where the prior is off by much, its
+    rows are too, and count little by their robust weights: one step is not enough. With fewer than MIN_POINTS it is
+    the prior.
 
     Args:
         inside: (K, 3) points in the camera's frame.
@@ -69,6 +77,8 @@ def fit_rows(
         noise: of a feature, px.
         prior: motion expected.
         sigma: standard deviation of its velocities, rad/s, and depths of the scene per second.
+        bend_sigmas: (2,) of its angular and its linear accelerations, rad/s^2 and units of the model per s^2, where
+            they are sought, too.
     """
     ahead = inside[:, 2] > 0
     features, inside = features[ahead], inside[ahead]
@@ -78,7 +88,10 @@ def fit_rows(
     measured = keyframe.measured[features].astype(np.float64)
     times = prior.row_times(camera.distort_points(measured)[:, 1])[:, None, None]
     precision = np.repeat([1.0, 1.0 / float(np.median(inside[:, 2])) ** 2], 3)
-    moved = np.zeros(6)
+    held = precision / sigma**2
+    if bend_sigmas is not None and bend_sigmas.all():  # two poses tell no acceleration
+        held = np.concatenate([held, np.repeat(1.0 / bend_sigmas**2, 3)])
+    moved = np.zeros(len(held))
     fitted = prior
     for _ in range(MAX_STEPS):
         x, y, z = inside.T
@@ -88,23 +101,36 @@ def fit_rows(
         by_point[:, 0, 0], by_point[:, 1, 1] = camera.fx / z, camera.fy / z
         by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
         by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
-        rows = np.concatenate([by_pose, times * by_pose], axis=2).reshape(-1, 12)
+        columns = [by_pose, times * by_pose, 0.5 * times**2 * by_pose][: 1 + len(held) // 6]
+        rows = np.concatenate(columns, axis=2).reshape(2 * len(z), -1)
         weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (RAYLEIGH_MEDIAN * noise) ** 2) / noise**2
         weighted = (np.repeat(weights, 2)[:, None] * rows).T
         information = weighted @ rows
+        information[range(12, 6 + len(held)), range(12, 6 + len(held))] += held[6:]
         normal = information.copy()
-        normal[np.arange(6, 12), np.arange(6, 12)] += precision / sigma**2
+        normal[range(6, 12), range(6, 12)] += held[:6]
         pull = weighted @ error.ravel()
-        pull[6:] -= precision / sigma**2 * moved
+        pull[6:] -= held * moved
         change = np.linalg.solve(normal, pull)
         inside = inside @ rotation_from_vector(change[None, :3])[0].T + change[3:6]
         moved += change[6:]
         fitted = _changed(prior, moved)
         if np.sqrt(2.0 * ((rows @ change) ** 2).mean()) < CONVERGED:
             break
-    of_pose, both, of_velocity = information[:6, :6], information[:6, 6:], information[6:, 6:]
-    return RowFit(prior, moved, of_velocity - both.T @ np.linalg.solve(of_pose, both), precision, sigma)
+    own = np.r_[6:12]
+    other = np.setdiff1d(np.arange(len(information)), own)
+    both = information[np.ix_(other, own)]
+    of_velocity = information[np.ix_(own, own)] - both.T @ np.linalg.solve(information[np.ix_(other, other)], both)
+    return RowFit(fitted, moved[:6], of_velocity, precision, sigma)
 
 
 def _changed(motion: RowMotion, by: FloatArray) -> RowMotion:
-    return replace(motion, angular=motion.angular + by[:3], linear=motion.linear + by[3:])
+    """With other velocities and, where (12,) are given, accelerations."""
+    turn, shift, twist, bend = np.concatenate([by, np.zeros(12 - len(by))]).reshape(4, 3)
+    return replace(
+        motion,
+        angular=motion.angular + turn,
+        linear=motion.linear + shift,
+        angular_acceleration=motion.angular_acceleration + twist,
+        linear_acceleration=motion.linear_acceleration + bend,
+    )

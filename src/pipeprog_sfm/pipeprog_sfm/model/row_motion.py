@@ -4,10 +4,11 @@
 The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
 are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
 (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). What the rows of a view
-tell beside points that many views hold corrects its velocity, with that of the spline as a prior: a narrow one within
-a long trajectory, a wide one at the ends, where a spline is poor, and for what is predicted of a new view. The
+tell beside points that many views hold corrects its velocity: within a long trajectory what changes from view to view
+(`row_corrections`), all of it at the ends, where a spline is poor, and for what is predicted of a new view. The
 accelerations are those of the spline: at 3 m/s^2, first and last row of 20 ms lie 0.15 mm off without them, which moves
-a pose by several times as much along what the rows hold poorly.
+a pose by several times as much along what the rows hold poorly. The first and the last view's are told by their rows,
+too: a spline knows nothing of what is beyond them.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
@@ -18,7 +19,7 @@ the read-out is 15 ms: three turns do.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Container, Mapping, MutableMapping
+from collections.abc import Container, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,7 @@ from scipy.spatial.transform import Rotation
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.model.row_corrections import NORMAL_SPREAD, corrections
 from pipeprog_sfm.model.row_fit import RowFit, fit_rows
 from pipeprog_sfm.model.sparse_model import SparseModel
 
@@ -51,10 +53,6 @@ LONG_TRAJECTORY = 4 * 2 * END_KNOTS
 # Standard deviations, from the views of the trajectory, by which a view's rows differ from the spline where it is taken
 # to be wrong: with six numbers of each of 100 views, by chance in one trajectory of 25.
 CONTRADICTED = 4.0
-NORMAL_SPREAD = 1.4826  # standard deviations of a normal distribution in its median absolute deviation
-# rad/s and depths of the scene per second, by which the spline's velocities are off where it is not wrong: the 6 %
-# above of a hand that sways by 0.004 rad at 1.7 Hz.
-SPLINE_SIGMA = 0.003
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
 # Views of a point that tells how one of them moves: with fewer, that view has too much say in where the point is, and
 # the point follows the view's own error.
@@ -63,7 +61,7 @@ LONG_TRACK = 6
 
 @dataclass(frozen=True)
 class _ByRows:
-    """Motions by stamp: of views where the rows decide, and of those where they are held to the spline."""
+    """Motions by stamp: of views where the rows decide, and of those that are held to the spline on average."""
 
     decided: dict[int, RowMotion]
     held: dict[int, RowMotion]
@@ -222,34 +220,49 @@ def _by_own_rows(
     """The spline's `motions` of views, in order of time, as their own rows correct them; those `wanted` alone.
 
     The rows decide for the outermost views, in a long trajectory for END_KNOTS at each end and for those that
-    contradict the spline. There, all others are held to it.
+    contradict the spline. There, all others are held to it on average.
     """
     stamps = [model.stamps[view] for view in views]
     gaps = np.diff(stamps, prepend=stamps[0], append=stamps[-1]) * 1e-9
     sigmas = END_CHANGE * np.maximum(gaps[:-1], gaps[1:])
     has_many = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points)) >= LONG_TRACK
-    at_ends: dict[int, RowMotion] = {}
-    inner: dict[int, RowFit] = {}
-    for number, view in enumerate(views.tolist()):
-        inwards = min(number, len(views) - 1 - number)
-        at_end = inwards < (END_KNOTS if is_long else 1)
-        if view not in wanted or not (at_end or is_long):
-            continue
-        stamp = stamps[number]
+
+    def fitted(number: int, sigma: float, bend_sigmas: FloatArray | None = None) -> RowFit:
+        view, stamp = views[number], stamps[number]
         own = model.point_of[model.features(view)]
         features = np.flatnonzero((own >= 0) & has_many[own])
         inside = model.points[own[features]] @ model.rotation[view].T + model.translation[view]
-        sigma = sigmas[number] * (DECAY**inwards if at_end else 1.0)
-        fit = fit_rows(inside, keyframes[stamp], features, model.noise, motions[stamp], sigma)
-        if at_end:
-            at_ends[stamp] = fit.motion
+        return fit_rows(inside, keyframes[stamp], features, model.noise, motions[stamp], sigma, bend_sigmas)
+
+    numbers = np.array([number for number, view in enumerate(views.tolist()) if view in wanted], np.intp)
+    inwards = np.minimum(numbers, len(views) - 1 - numbers)
+    at_end = inwards < (END_KNOTS if is_long else 1)
+    bends = _bends(motions.values())  # an end bends as the walk does
+    decided = {
+        stamps[number]: fitted(number, sigmas[number] * DECAY**knot, None if knot else bends).motion
+        for number, knot in zip(numbers[at_end].tolist(), inwards[at_end].tolist(), strict=True)
+    }
+    inner = numbers[~at_end] if is_long else numbers[:0]
+    if not len(inner):
+        return _ByRows(decided, {})
+    fits = [fitted(number, sigmas[number]) for number in inner.tolist()]
+    wrong = _contradicted(fits)
+    off = sigmas[inner] * np.where(wrong, np.inf, DECAY ** inwards[~at_end])
+    times = np.array([stamps[number] - stamps[0] for number in inner]) * 1e-9
+    changes = corrections(fits, times, model.rotation[views[inner]], off)
+    held = {}
+    for number, fit, change, is_wrong in zip(inner.tolist(), fits, changes, wrong.tolist(), strict=True):
+        if is_wrong:
+            decided[stamps[number]] = fit.motion
         else:
-            inner[stamp] = fit
-    wrong = dict(zip(inner, _contradicted(list(inner.values())), strict=True))
-    return _ByRows(
-        at_ends | {stamp: fit.motion for stamp, fit in inner.items() if wrong[stamp]},
-        {stamp: fit.held_to(SPLINE_SIGMA) for stamp, fit in inner.items() if not wrong[stamp]},
-    )
+            held[stamps[number]] = fit.changed(change)
+    return _ByRows(decided, held)
+
+
+def _bends(motions: Iterable[RowMotion]) -> FloatArray:
+    """(2,) root mean square of the angular and the linear accelerations, rad/s^2 and units of the model per s^2."""
+    rates = [(motion.angular_acceleration, motion.linear_acceleration) for motion in motions]
+    return np.asarray(np.sqrt(np.square(rates).mean(axis=(0, 2))))
 
 
 def _contradicted(fits: list[RowFit]) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scenes import CAMERA, STEP, pose, position_errors, view
+from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolling_shutter import RowMotion
@@ -121,21 +122,34 @@ def test_views_of_a_sudden_turn_follow_their_own_rows() -> None:
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
 
 
-def test_a_fit_is_held_to_a_prior_as_if_it_were_made_with_it(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
-    mapper = told[0]
-    model, stamp = mapper.map.published, 4 * STEP
-    keyframe = mapper.map.keyframes[stamp]
-    own = model.point_of[model.features(model.stamps.index(stamp))]
-    features = np.flatnonzero(own >= 0)
-    inside = model.points[own[features]] @ model.rotation[4].T + model.translation[4]
-    known = mapper.map.motions(model)[stamp]
-    prior = replace(known, angular=known.angular + np.array([0.0, 0.05, 0.0]))
-    wide, narrow = (fit_rows(inside, keyframe, features, model.noise, prior, sigma) for sigma in (0.2, 0.003))
-    held = wide.held_to(0.003)
-    assert np.linalg.norm(narrow.moved - wide.moved) > 0.01, "a narrow prior decides otherwise"
-    # The robust weights are those of the wide fit.
-    np.testing.assert_allclose(held.angular, narrow.motion.angular, atol=2e-3)
-    np.testing.assert_allclose(held.linear, narrow.motion.linear, atol=2e-3 * np.median(inside[:, 2]))
+def test_the_acceleration_of_a_view_is_told_by_its_rows() -> None:
+    """It is off by 10 m/s^2 as a spline's is where a walk begins: 0.4 px at the first row and at the last one."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-1.2, -0.6, 1.5], [1.2, 0.6, 2.5], (2000, 3))
+    true = RowMotion(READOUT, CAMERA.height, *np.array([[1.4, 0.2, 0], [0.1, 0.3, 0], [8.0, -2.0, 4.0], [0, -2.0, 0]]))
+    pixels = _shown(points, true) + rng.normal(0.0, 0.1, (len(points), 2))
+    keyframe = Keyframe.of(0, Features(pixels.astype(np.float32), np.zeros((len(pixels), 128), np.float32)), CAMERA)
+    spline = replace(
+        true, linear_acceleration=np.array([-2.0, -2.0, 4.0]), linear=true.linear + np.array([0.0, 0.05, 0.0])
+    )
+    every = np.arange(len(points))
+    held, free = (fit_rows(points, keyframe, every, 0.1, spline, 0.2, bends) for bends in (None, np.array([3.0, 5.0])))
+    np.testing.assert_array_equal(held.motion.linear_acceleration, spline.linear_acceleration)
+    np.testing.assert_allclose(free.motion.linear_acceleration, true.linear_acceleration, atol=3.0)
+    np.testing.assert_allclose(free.motion.linear, true.linear, atol=0.03)
+
+
+def _shown(points: NDArray[np.float64], motion: RowMotion) -> NDArray[np.float64]:
+    """(N, 2) pixels of points (N, 3) in the camera's frame, each at the time of its own row, found by iteration."""
+    times: NDArray[np.float64] = np.zeros(len(points), np.float64)
+    pixels: NDArray[np.float64] = np.zeros((len(points), 2), np.float64)
+    for _ in range(10):
+        time = times[:, None]
+        turns = Rotation.from_rotvec((motion.angular + 0.5 * motion.angular_acceleration * time) * time)
+        x, y, z = (turns.apply(points) + (motion.linear + 0.5 * motion.linear_acceleration * time) * time).T
+        pixels = np.stack([CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy], axis=1)
+        times = np.asarray(motion.row_times(CAMERA.distort_points(pixels)[:, 1]), np.float64)
+    return pixels
 
 
 def test_few_points_tell_no_velocity(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
@@ -144,7 +158,7 @@ def test_few_points_tell_no_velocity(told: tuple[Mapper, dict[int, NDArray[Any]]
     keyframe, prior = mapper.map.keyframes[4 * STEP], mapper.map.motions(mapper.map.published)[4 * STEP]
     fit = fit_rows(np.ones((10, 3)), keyframe, np.arange(10), 0.3, prior, 0.2)
     assert (fit.sigmas == np.inf).all()
-    for motion in (fit.motion, fit.held_to(0.003)):
+    for motion in (fit.motion, fit.changed(np.zeros(6))):
         np.testing.assert_array_equal(motion.linear, prior.linear)
         np.testing.assert_array_equal(motion.angular, prior.angular)
 
