@@ -4,11 +4,11 @@
 The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
 are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
 (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). What the rows of a view
-tell beside points that many views hold corrects its velocity: within a long trajectory what changes from view to view
-(`row_corrections`), all of it at the ends, where a spline is poor, and for what is predicted of a new view. The
-accelerations are those of the spline: at 3 m/s^2, first and last row of 20 ms lie 0.15 mm off without them, which moves
-a pose by several times as much along what the rows hold poorly. The first and the last view's are told by their rows,
-too: a spline knows nothing of what is beyond them.
+tell beside points that many views hold corrects its velocity: in a long trajectory what changes from view to view
+(`row_corrections`), all of it in the outermost views, where a spline is poor, and for what is predicted of a new view.
+The accelerations are those of the spline: at 3 m/s^2, first and last row of 20 ms lie 0.15 mm off without them, which
+moves a pose by several times as much along what the rows hold poorly. Those of the outermost views are told by their
+rows, too: a spline knows nothing of what is beyond them.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.model.row_corrections import NORMAL_SPREAD, corrections
+from pipeprog_sfm.model.row_corrections import contradicted, corrections
 from pipeprog_sfm.model.row_fit import RowFit, fit_rows
 from pipeprog_sfm.model.sparse_model import SparseModel
 
@@ -47,12 +47,10 @@ DEGREE = 5
 # Knots of such a spline from an end inwards that its condition moves, each 0.43 times as much as the one before; of the
 # fifth it is a thirtieth.
 END_KNOTS, DECAY = 4, 0.43
-# Views of a trajectory from which all of these follow their own rows, a quarter of it at most: of nine, six that do
-# bend the scene. In a shorter one, and in a window of the nearest views, the outermost alone do.
+# Views of a trajectory whose rows correct all of them together, of which these at its ends are a quarter at most: of
+# nine, six whose rows decide bend the scene. In a shorter one, and in a window of the nearest views, those of the
+# outermost alone count.
 LONG_TRAJECTORY = 4 * 2 * END_KNOTS
-# Standard deviations, from the views of the trajectory, by which a view's rows differ from the spline where it is taken
-# to be wrong: with six numbers of each of 100 views, by chance in one trajectory of 25.
-CONTRADICTED = 4.0
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
 # Views of a point that tells how one of them moves: with fewer, that view has too much say in where the point is, and
 # the point follows the view's own error.
@@ -61,10 +59,10 @@ LONG_TRACK = 6
 
 @dataclass(frozen=True)
 class _ByRows:
-    """Motions by stamp: of views where the rows decide, and of those that are held to the spline on average."""
+    """Motions by stamp: of views where the spline is no alternative, and of all that rows correct together."""
 
     decided: dict[int, RowMotion]
-    held: dict[int, RowMotion]
+    corrected: dict[int, RowMotion]
 
 
 def row_motions(
@@ -103,7 +101,7 @@ def row_motions(
             if motions and readout > 0.0:
                 is_long = near is None and len(part) >= LONG_TRAJECTORY
                 fits = _by_own_rows(model, part, keyframes, motions, wanted, is_long)
-                motions |= fits.decided | (fits.held if rows_correct else {})
+                motions |= fits.decided | (fits.corrected if rows_correct else {})
             found |= motions
     asked = {model.stamps[view] for view in wanted}
     return {stamp: motion for stamp, motion in found.items() if stamp in asked}
@@ -219,8 +217,8 @@ def _by_own_rows(
 ) -> _ByRows:
     """The spline's `motions` of views, in order of time, as their own rows correct them; those `wanted` alone.
 
-    The rows decide for the outermost views, in a long trajectory for END_KNOTS at each end and for those that
-    contradict the spline. There, all others are held to it on average.
+    The rows alone decide for the outermost views. In a long trajectory they correct all others, and the spline is no
+    alternative for END_KNOTS at each end and for those that contradict it.
     """
     stamps = [model.stamps[view] for view in views]
     gaps = np.diff(stamps, prepend=stamps[0], append=stamps[-1]) * 1e-9
@@ -235,40 +233,27 @@ def _by_own_rows(
         return fit_rows(inside, keyframes[stamp], features, model.noise, motions[stamp], sigma, bend_sigmas)
 
     numbers = np.array([number for number, view in enumerate(views.tolist()) if view in wanted], np.intp)
-    inwards = np.minimum(numbers, len(views) - 1 - numbers)
-    at_end = inwards < (END_KNOTS if is_long else 1)
+    knots = np.minimum(numbers, len(views) - 1 - numbers)
     bends = _bends(motions.values())  # an end bends as the walk does
-    decided = {
-        stamps[number]: fitted(number, sigmas[number] * DECAY**knot, None if knot else bends).motion
-        for number, knot in zip(numbers[at_end].tolist(), inwards[at_end].tolist(), strict=True)
-    }
-    inner = numbers[~at_end] if is_long else numbers[:0]
-    if not len(inner):
+    decided = {stamps[number]: fitted(number, sigmas[number], bends).motion for number in numbers[knots == 0]}
+    if not is_long:
         return _ByRows(decided, {})
-    fits = [fitted(number, sigmas[number]) for number in inner.tolist()]
-    wrong = _contradicted(fits)
-    off = sigmas[inner] * np.where(wrong, np.inf, DECAY ** inwards[~at_end])
+    inner, knots = numbers[knots > 0], knots[knots > 0]
+    fits = [fitted(number, sigmas[number]) for number in inner]
     times = np.array([stamps[number] - stamps[0] for number in inner]) * 1e-9
-    changes = corrections(fits, times, model.rotation[views[inner]], off)
-    held = {}
-    for number, fit, change, is_wrong in zip(inner.tolist(), fits, changes, wrong.tolist(), strict=True):
-        if is_wrong:
-            decided[stamps[number]] = fit.motion
-        else:
-            held[stamps[number]] = fit.changed(change)
-    return _ByRows(decided, held)
+    changes = corrections(fits, times, model.rotation[views[inner]], sigmas[inner] * DECAY**knots)
+    corrected = [fit.changed(change) for fit, change in zip(fits, changes, strict=True)]
+    is_wrong = contradicted(np.abs([fit.moved / fit.sigmas for fit in fits]))
+    for number, knot, wrong, motion in zip(inner, knots, is_wrong, corrected, strict=True):
+        if wrong or knot < END_KNOTS:
+            decided[stamps[number]] = motion
+    return _ByRows(decided, {stamps[number]: motion for number, motion in zip(inner, corrected, strict=True)})
 
 
 def _bends(motions: Iterable[RowMotion]) -> FloatArray:
     """(2,) root mean square of the angular and the linear accelerations, rad/s^2 and units of the model per s^2."""
     rates = [(motion.angular_acceleration, motion.linear_acceleration) for motion in motions]
     return np.asarray(np.sqrt(np.square(rates).mean(axis=(0, 2))))
-
-
-def _contradicted(fits: list[RowFit]) -> NDArray[np.bool_]:
-    """(N,) whether the rows of a view contradict its prior more than those of most others do."""
-    apart = np.abs([fit.moved / fit.sigmas for fit in fits]).reshape(-1, 6)
-    return (apart > CONTRADICTED * NORMAL_SPREAD * np.median(apart, axis=0)).any(axis=1) if fits else np.empty(0, bool)
 
 
 def _rates(stamps: list[int], rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, ...]:
