@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rolling shutter of a sparse model: how each view moves, and its features where the middle row's camera has them.
 
-The velocities are those of a spline through the poses of the views, and never unknowns of each view: velocities that
+The velocities are those of a spline through the poses (`pose_spline`), and never unknowns of each view: velocities that
 are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
 (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). What the rows of a view
 tell beside points that many views hold corrects its velocity: in a long trajectory what changes from view to view
@@ -23,27 +23,21 @@ from collections.abc import Container, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
+from pipeprog_sfm.model.pose_spline import spline_rates
 from pipeprog_sfm.model.row_corrections import contradicted, corrections
 from pipeprog_sfm.model.row_fit import RowFit, fit_rows
 from pipeprog_sfm.model.sparse_model import SparseModel
 
 MAX_GAP = 1.0  # s between two views that still tell the velocity between them: a hand sways at 1 to 2 Hz
-MIN_GAP = 0.02  # s between two knots: poses are known to 0.3 mm, and their difference over it to 0.02 m/s
 NEAR = 16  # views nearest in time that tell how one moves: a knot has 0.43 of the say of the one before, see DECAY
 # rad/s and depths of the scene per second, for each second to the next pose: how far the velocity at an end of the
 # spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
 END_CHANGE = 1.0
-# Of the spline. A hand sways at up to 1.7 Hz: through poses 0.2 s apart, a cubic one has such a velocity 21 % too low
-# (1 - 3 sin(w) / (2 + cos(w)) / w with w = 2 pi 1.7 0.2), one of degree 5 has it 6 % too low.
-DEGREE = 5
 # Knots of such a spline from an end inwards that its condition moves, each 0.43 times as much as the one before; of the
 # fifth it is a thirtieth.
 END_KNOTS, DECAY = 4, 0.43
@@ -93,7 +87,7 @@ def row_motions(
         ends = np.flatnonzero(np.diff(stamps) > MAX_GAP * 1e9) + 1
         for part in np.split(order, ends):
             own = [model.stamps[view] for view in part]
-            rates = _rates(own, model.rotation[part], centres[part])  # none of a single view
+            rates = spline_rates(own, model.rotation[part], centres[part])  # none of a single view
             motions = {
                 stamp: RowMotion(readout, keyframes[stamp].camera.height, *of_view)
                 for stamp, *of_view in zip(own, *rates, strict=False)
@@ -254,55 +248,3 @@ def _bends(motions: Iterable[RowMotion]) -> FloatArray:
     """(2,) root mean square of the angular and the linear accelerations, rad/s^2 and units of the model per s^2."""
     rates = [(motion.angular_acceleration, motion.linear_acceleration) for motion in motions]
     return np.asarray(np.sqrt(np.square(rates).mean(axis=(0, 2))))
-
-
-def _rates(stamps: list[int], rotations: FloatArray, centres: FloatArray) -> tuple[FloatArray, ...]:
-    """(V, 3) linear and angular velocities and accelerations of the model as seen from cameras at ascending stamps, ns.
-
-    Empty for one view. rotations (V, 3, 3) camera_from_model, centres (V, 3).
-    """
-    times = (np.array(stamps) - stamps[0]) * 1e-9
-    knots = _apart(times)
-    if len(knots) < 2:
-        return (np.empty((0, 3)),) * 4
-    turns = _unit_quaternions(rotations.transpose(0, 2, 1))
-    degree = DEGREE if len(knots) > 2 else 3  # two poses tell a line
-    # A natural spline: one whose ends are free doubles the error of its last velocities.
-    ends = [(order, np.zeros(7)) for order in range((degree + 1) // 2, degree)]
-    spline = make_interp_spline(times[knots], np.c_[centres, turns][knots], k=degree, bc_type=(ends, ends))
-    # R X + s with s = -R c, the centre c and the rotation R of a moment from that of the stamp.
-    (linear, angular), (bent, twisted) = (_in_cameras(rotations, turns, spline(times, order)) for order in (1, 2))
-    return linear, angular, bent + 2.0 * np.cross(angular, linear), twisted
-
-
-def _in_cameras(rotations: FloatArray, turns: FloatArray, rates: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(V, 3) of the model beside cameras, linear and angular, from the derivatives (V, 7) of centres and quaternions.
-
-    q' = q w / 2 and, for its part across q, q'' = q w' / 2 with the angular velocity w in the camera's frame; what is
-    along q changes its length alone.
-    """
-    back = Rotation.from_quat(turns).inv().as_matrix()
-    own_turn = 2.0 * (back @ _imaginary(turns, rates[:, 3:])[..., None])[..., 0]
-    return -np.einsum("vij,vj->vi", rotations, rates[:, :3]), -own_turn
-
-
-def _unit_quaternions(rotations: FloatArray) -> FloatArray:
-    """(V, 4) quaternions x, y, z, w of (V, 3, 3) rotations, each with the sign nearest to the one before."""
-    turns = Rotation.from_matrix(rotations).as_quat()
-    signs = np.cumprod(np.r_[1.0, np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)])
-    return np.asarray(turns * signs[:, None])
-
-
-def _imaginary(turns: FloatArray, rates: FloatArray) -> FloatArray:
-    """(V, 3) imaginary part of rates times the conjugates of turns, quaternions x, y, z, w (V, 4)."""
-    vector, scalar = turns[:, :3], turns[:, 3:]
-    return np.asarray(scalar * rates[:, :3] - rates[:, 3:] * vector - np.cross(rates[:, :3], vector))
-
-
-def _apart(times: FloatArray) -> NDArray[np.intp]:
-    """Indices of ascending times that are MIN_GAP apart, from the first one."""
-    kept: list[int] = []
-    for index, time in enumerate(times):
-        if not kept or time - times[kept[-1]] >= MIN_GAP:
-            kept.append(index)
-    return np.array(kept, np.intp)
