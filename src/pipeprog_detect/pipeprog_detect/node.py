@@ -282,6 +282,14 @@ class DetectNode(Node):
             del self._left_out[stamp]
         self._hand_over()
 
+    def _give_up(self, stamps: Sequence[int], why: str) -> None:
+        """No map waits any more for these keyframes, whose images will not come."""
+        for stamp in stamps:
+            text = f"the pose of a keyframe at {stamp} ns has come, its image {why}: it is left out"
+            self._intake.reject(POSES, InvalidMessageError("no image", text))
+        if stamps:
+            self._leave_out(stamps)
+
     def _missing(self, poses: ReceivedPoses) -> set[int]:
         return set(poses.stamps.tolist()).difference(self._numbers, self._left_out)
 
@@ -293,7 +301,11 @@ class DetectNode(Node):
         status, poses, velocities = newest.status, newest.poses, newest.velocities
         asked = self._finish.expected is not None and status.revision >= self._finish.expected
         final = status.final or asked  # the final map may come before the request to finish, and is the same then
-        if not (self._intermediate or final) or self._missing(poses):
+        if not (self._intermediate or final):
+            return
+        missing = self._missing(poses)
+        if missing:
+            self._give_up(sorted(filter(self._keyframes.missed, missing)), "came before this node was there")
             return
         self._maps.discard(newest)
         if velocities is not None and len(velocities.linear) != len(poses.stamps):
@@ -330,10 +342,8 @@ class DetectNode(Node):
         missing = self._missing(newest.poses) if newest is not None else set()
         self._waited = {stamp: self._waited.get(stamp, 0) + 1 for stamp in missing}
         lost = [stamp for stamp, ticks in self._waited.items() if ticks >= PATIENCE]
-        for stamp in lost:
-            text = f"the pose of a keyframe at {stamp} ns has come, its image has not: it is left out"
-            self._intake.reject(POSES, InvalidMessageError("no image", text))
-        self._leave_out(lost)
+        self._give_up(lost, "has not")
+        self._hand_over()
 
     def _start_worker(self, kept: Iterable[Keyframe | Retire]) -> WorkerProcess:
         return WorkerProcess(self, serve, (*self._arguments, kept, self._named), self._on_event, self._on_death)

@@ -50,6 +50,7 @@ class KeyframeInput:
         self._cameras: dict[_Key, Camera] = {}  # without image
         self._stamps: dict[_Key, int] = {}  # of the keyframes handed on: theirs alone
         self._keys: dict[int, _Key] = {}  # the reverse
+        self._earliest: int | None = None  # stamp of anything that has come
         depth = qos.reliable(DEPTH) if known is None else qos.kept(DEPTH)
         intake.subscribe(
             CompressedImage, IMAGES, received_images.compressed_image, self._on_image, depth, dropped=self._on_dropped
@@ -63,6 +64,10 @@ class KeyframeInput:
         for stamp in stamps:
             if stamp in self._keys:
                 del self._stamps[self._keys.pop(stamp)]
+
+    def missed(self, stamp: int) -> bool:
+        """Whether a keyframe was published before this node was there: topics keep their order, and later ones came."""
+        return self._earliest is not None and stamp < self._earliest
 
     def _on_image(self, image: ReceivedImage) -> None:
         key = image.stamp, image.frame_id
@@ -86,6 +91,7 @@ class KeyframeInput:
         self._lose(messages.stamp_ns(message.header.stamp))
 
     def _is_new(self, key: _Key, topic: str) -> bool:
+        self._earliest = key[0] if self._earliest is None else min(key[0], self._earliest)
         if key[0] in self._known or (self._comes_again and key in self._stamps):
             return False
         if key in self._stamps:

@@ -330,6 +330,18 @@ def test_an_image_that_never_comes_is_not_waited_for_for_ever(stage: Callable[..
     assert scene.values()["dropped on keyframe_poses: no image"] == "1"
 
 
+def test_a_keyframe_from_before_this_node_was_there_is_not_waited_for(stage: Callable[..., Stage]) -> None:
+    """Topics keep their order: once a later one has come, there is no point in being patient."""
+    scene = stage()
+    scene.node._timer.cancel()
+    scene.send_image(START + STEP)
+    scene.send_calibration(START + STEP)
+    scene.spin_until(lambda: scene.node._numbers)
+    scene.send_map(START, 1, [START, START + STEP], corner())
+    scene.spin_until(lambda: scene.pipes)
+    assert scene.values()["dropped on keyframe_poses: no image"] == "1"
+
+
 def test_a_worker_that_is_killed_loses_nothing(stage: Callable[..., Stage]) -> None:
     """The next one has the keyframes, gives the same names, and makes the map that was in work."""
     scene = stage()
