@@ -4,8 +4,9 @@
     .venv/bin/python -m benchmarks.experiments [--methods paper ours] [--layouts lab field] [--overlaps 95]
 
 Every survey goes through the node graph and is kept in out/surveys: a run that was interrupted goes on where it was,
-the survey that was under way is done again. After each survey the tables (results/experiment_table_1.json to 7) and
-figures (docs/images/experiment_figure_8 to 11) are written anew from all that is there. The sites with the highest
+the survey that was under way is done again. After each survey the tables (results/experiment_table_1.json to 7) are
+written anew from all that is there; of methods and overlaps of which no survey is kept they keep what they have. The
+figures (docs/images/experiment_figure_8 to 11) come last. The sites with the highest
 overlap come first. `--size 4k` films as the paper did: rendering then takes some 25 minutes of one core for a lab and
 an hour for a field site, and each survey several times what it takes at 720p.
 """
@@ -350,26 +351,29 @@ TABLES: dict[int, tuple[str, str, dict[str, Quantity]]] = {
 
 
 def write_tables(cases: Sequence[Case], size: str) -> None:
-    """All tables from what is known of the cases; a table of which nothing is known is left as it is."""
+    """All tables from what is known of the cases, and from the tables as they are where nothing is known of a case."""
     for number, (title, layout, quantities) in TABLES.items():
         surveys = {(case.method, case.overlap): _surveys(cases, case) for case in cases if case.layout == layout}
         everything = [survey for known in surveys.values() for survey in known]
         if not everything:
             continue
-        content = {
+        of_what = {
             "title": f"{title} ({size})",
             "command": "make experiments",
             "size": size,
             "recordings": sorted({case.recording.made_by for case in cases if case.layout == layout}),
-            "settings": METHODS,
-            "commits": {
-                TITLES[method]: sorted({s["commit"] for (m, _), known in surveys.items() if m == method for s in known})
-                for method in METHODS
-            },
-            "versions": next((survey["versions"] for survey in everything if "versions" in survey), None),
-            "rows": _rows(layout, quantities, surveys),
+            "settings": {method: list(settings) for method, settings in METHODS.items()},
         }
-        (RESULTS / f"experiment_table_{number}.json").write_text(json.dumps(content, indent=1) + "\n")
+        target = RESULTS / f"experiment_table_{number}.json"
+        earlier = json.loads(target.read_text()) if target.exists() else {}
+        if any(earlier.get(key) != value for key, value in of_what.items()):
+            earlier = {}  # of other sites
+        content = of_what | {
+            "commits": {TITLES[method]: _commits(method, surveys, earlier) for method in METHODS},
+            "versions": next((survey["versions"] for survey in everything if "versions" in survey), None),
+            "rows": _rows(layout, quantities, surveys, earlier),
+        }
+        target.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def _surveys(cases: Sequence[Case], like: Case) -> list[Known]:
@@ -386,40 +390,52 @@ def _surveys(cases: Sequence[Case], like: Case) -> list[Known]:
     return known
 
 
-def _rows(
-    layout: str, quantities: dict[str, Quantity], surveys: dict[tuple[str, float], list[Known]]
-) -> list[dict[str, Any]]:
+Surveys = dict[tuple[str, float], list[Known]]  # by method and overlap
+
+
+def _commits(method: str, surveys: Surveys, earlier: Known) -> list[str]:
+    """Of a method's surveys; where nothing is known at one of its overlaps, those of the earlier table as well."""
+    own = [known for (each, _), known in surveys.items() if each == method]
+    commits = {survey["commit"] for known in own for survey in known}
+    if not all(own):
+        commits |= set(earlier.get("commits", {}).get(TITLES[method], []))
+    return sorted(commits)
+
+
+def _rows(layout: str, quantities: dict[str, Quantity], surveys: Surveys, earlier: Known) -> list[dict[str, Any]]:
+    """The rows of a table; what no survey is known of is as in the `earlier` one."""
+    before = {(row["overlap [%]"], row["quantity"]): row for row in earlier.get("rows", [])}
     rows = []
     for overlap in OVERLAPS[layout]:
+        percent = round(100 * overlap)
         for name, quantity in quantities.items():
             paper = PAPER.get((layout, 100 * overlap), {}).get(name)
-            values = {TITLES[m]: quantity(known) if (known := surveys.get((m, overlap))) else None for m in METHODS}
+            values = {
+                TITLES[method]: quantity(known) if known else before.get((percent, name), {}).get(TITLES[method])
+                for method in METHODS
+                for known in [surveys.get((method, overlap))]
+            }
             if paper is not None or any(value is not None for value in values.values()):
-                row = {"overlap [%]": round(100 * overlap), "quantity": name, "paper's figure": paper}
-                rows.append(row | values)
+                rows.append({"overlap [%]": percent, "quantity": name, "paper's figure": paper} | values)
     return rows
 
 
 def draw(cases: Sequence[Case]) -> None:
-    """Figures 9 to 11; Figure 8 is board_views'."""
+    """Figures 9 and 10 from the tables, and Figure 11 of the first field; Figure 8 is board_views'."""
     IMAGES.mkdir(exist_ok=True)
-    of = {(case.layout, case.method, case.overlap): _surveys(cases, case) for case in cases}
     figure = Figure(figsize=(11, 3), layout="constrained")
     names = ("median distance [mm]", "RMS distance [mm]", "pipes covered [%]", "equal counts: pipes covered [%]")
     for panel, name in zip(figure.subplots(1, 4), names, strict=True):
-        _lines(panel, "lab", name, CLOUD[name], of)
+        _lines(panel, 3, name)
     figure.axes[0].legend()
     figure.savefig(IMAGES / "experiment_figure_9.png", dpi=80)
 
     figure = Figure(figsize=(11, 5.5), layout="constrained")
-    shown = {
-        "F": RATES["F"],
-        "radius RMSE [mm]": RADIUS["radius RMSE [mm]"],
-        "length error [%]": LENGTH["length error [%]"],
-    }
-    for row, layout in zip(figure.subplots(2, 3), OVERLAPS, strict=True):
-        for panel, (name, quantity) in zip(row, shown.items(), strict=True):
-            _lines(panel, layout, name, quantity, of)
+    tables = {"lab": (4, 4, 4), "field": (5, 6, 7)}
+    shown = ("F", "radius RMSE [mm]", "length error [%]")
+    for row, (layout, numbers) in zip(figure.subplots(2, 3), tables.items(), strict=True):
+        for panel, number, name in zip(row, numbers, shown, strict=True):
+            _lines(panel, number, name)
             panel.set_title(layout)
     figure.axes[0].legend()
     figure.savefig(IMAGES / "experiment_figure_10.png", dpi=80)
@@ -435,21 +451,15 @@ def draw(cases: Sequence[Case]) -> None:
             cv2.imwrite(str(target), _pipes(RUNS / case.name)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
-def _lines(
-    panel: Any, layout: str, name: str, quantity: Quantity, of: dict[tuple[str, str, float], list[Known]]
-) -> None:
-    """A quantity over the overlap: both methods, and the paper's figures where they are known."""
-    for number, method in enumerate(METHODS):
-        points = [
-            (100 * overlap, value)
-            for overlap in OVERLAPS[layout]
-            if (known := of.get((layout, method, overlap))) and (value := quantity(known)) is not None
-        ]
+def _lines(panel: Any, number: int, name: str) -> None:
+    """A quantity of a table over the overlap: of all methods, and the paper's figures where they are known."""
+    table = json.loads((RESULTS / f"experiment_table_{number}.json").read_text())
+    rows = [row for row in table["rows"] if row["quantity"] == name]
+    styles = [(title, f"C{index}o-") for index, title in enumerate(TITLES.values())]
+    for column, style in (*styles, ("paper's figure", "k*")):
+        points = [(float(row["overlap [%]"]), float(row[column])) for row in rows if row[column] is not None]
         if points:
-            panel.plot(*zip(*points, strict=True), "o-", color=f"C{number}", label=TITLES[method])
-    paper = [(x, known[name]) for (where, x), known in PAPER.items() if where == layout and name in known]
-    if paper:
-        panel.plot(*zip(*paper, strict=True), "k*", label="paper's figure")
+            panel.plot(*np.transpose(points), style, label=column)
     panel.set(xlabel="least overlap [%]", ylabel=name)
     panel.set_ylim(bottom=0)
 

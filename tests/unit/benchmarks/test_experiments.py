@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import copy
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks import experiments
+from benchmarks.recordings import Recording
 
 PIPES = [
     {"true_radius": 0.0086, "radius_error_mm": 0.3, "length_error_percent": -1.0},
     {"true_radius": 0.1095, "radius_error_mm": -0.4, "length_error_percent": 3.0},
 ]
-DONE = {
+DONE: dict[str, Any] = {
     "commit": "a",
     "score": {"classification": {"true_positives": 2, "false_positives": 1, "false_negatives": 1}, "pipes": PIPES},
     "truth": [{"radius": 0.0086}, {"radius": 0.1095}, {"radius": 0.1095}],
-    "network": {"images": 10},
+    "network": {"images": 10, "images below the band": 1},
 }
 FAILED = {"commit": "b", "failed": "no board", "pipes": [0.0086, 0.1095, 0.1095]}
 
@@ -51,3 +54,38 @@ def test_a_network_of_images_is_counted_against_the_band(tmp_path: Path) -> None
     assert experiments.network(tmp_path, 0.85, "ours") == ours
     assert experiments.network(tmp_path, 0.85, "paper") == ours | {experiments.UNEXPLAINED: 1}
     assert experiments.NETWORK["images below the band [%]"]([{"network": ours}, {"network": ours}]) == 33.3
+
+
+def test_a_table_keeps_what_no_survey_is_kept_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(experiments, "RESULTS", tmp_path)
+    monkeypatch.setattr(experiments, "RUNS", tmp_path)
+    recording = Recording(tmp_path / "field.mcap", "made of nothing")
+    cases = [
+        experiments.Case("field", recording, method, overlap)
+        for method in ("paper", "ours")
+        for overlap in (0.85, 0.95)
+    ]
+    recording.beside("truth.json").write_text(json.dumps({"pipes": DONE["truth"]}))
+    for case in cases:
+        case.kept.write_text(json.dumps(DONE))
+    experiments.write_tables(cases, "720p")
+    for case in cases:
+        case.kept.unlink()
+    better = copy.deepcopy(DONE) | {"commit": "c"}
+    better["score"]["pipes"] = PIPES[:1]
+    cases[-1].kept.write_text(json.dumps(better))
+    experiments.write_tables(cases, "720p")
+    table = json.loads((tmp_path / "experiment_table_7.json").read_text())
+    found = {row["overlap [%]"]: row for row in table["rows"] if row["quantity"] == "length error [%]"}
+    assert (found[85]["paper's method"], found[85]["ours"]) == (2.0, 2.0)
+    assert (found[95]["paper's method"], found[95]["ours"]) == (2.0, 1.0)
+    # Of a pipe that the new survey has not found nothing is kept.
+    thick = [
+        row for row in table["rows"] if (row["overlap [%]"], row["quantity"]) == (95, "length error of 109.5 mm [%]")
+    ]
+    assert [(row["paper's method"], row["ours"]) for row in thick] == [(3.0, None)]
+    assert (table["commits"]["paper's method"], table["commits"]["ours"]) == (["a"], ["a", "c"])
+
+    experiments.write_tables(cases, "480p")  # other sites
+    table = json.loads((tmp_path / "experiment_table_7.json").read_text())
+    assert {row["overlap [%]"] for row in table["rows"] if row["ours"] is not None} == {95}
