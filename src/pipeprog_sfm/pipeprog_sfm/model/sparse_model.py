@@ -36,6 +36,7 @@ class SparseModel:
         self.points: FloatArray = np.empty((0, 3))
         self.noise = INITIAL_NOISE
         self.adjusted_at = 2  # views at the last global adjustment
+        self.settled_readout = 0.0  # s, with which poses and the shifts of features were last made to agree
         self._rays: FloatArray = np.empty((0, 2))
         self._view_of: NDArray[np.int32] = np.empty(0, np.int32)
         self._point_of: IntArray = np.empty(0, np.int64)

@@ -163,7 +163,7 @@ class Mapper:
         """Tries the waiting keyframes once more and adjusts everything."""
         adjusted = []
         for model in self.map.models:
-            self.map.adjust_globally(model, MAX_TURNS)
+            self.map.settle(model)
             adjusted.append(list(model.stamps))
             for view in reversed(doubtful_views(model, self.map.keyframes) if self.map.readout else []):
                 if len(model) > 2:
@@ -261,6 +261,7 @@ class Mapper:
         self.map.revision += 1
         if self.map.readout:
             self.map.adjust_globally(best, MAX_TURNS)
+        best.settled_readout = self.map.readout
         self.map.waiting = [stamp for stamp in self.map.waiting if stamp not in best.stamps]
         return True
 

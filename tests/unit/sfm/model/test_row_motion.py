@@ -122,6 +122,19 @@ def test_views_of_a_sudden_turn_follow_their_own_rows() -> None:
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
 
 
+def test_a_read_out_that_was_a_fifth_off_leaves_no_trace() -> None:
+    """Turns alone leave the scene bent by it: shifts and poses agree with each other there."""
+    told, truth = walk(READOUT, count=40)
+    mapper, _ = walk(1.2 * READOUT, count=40)
+    mapper.map.readout = READOUT
+    mapper.map.replace_camera(CAMERA, CAMERA)
+    mapper.finish()
+    of_told, of_other = (
+        float(np.sqrt((position_errors(each.map.camera_from_model(), truth) ** 2).mean())) for each in (told, mapper)
+    )
+    assert of_other < 1.1 * of_told
+
+
 def test_the_acceleration_of_a_view_is_told_by_its_rows() -> None:
     """It is off by 10 m/s^2 as a spline's is where a walk begins: 0.4 px at the first row and at the last one."""
     rng = np.random.default_rng(1)
