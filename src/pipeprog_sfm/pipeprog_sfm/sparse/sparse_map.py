@@ -30,7 +30,8 @@ OTHER_READOUT = 0.02
 # Numerische Mathematik 3, 1961). In this order the largest comes last; the turn after it is to take its noise away.
 RETURNING = 0.95
 STEPS = 1.0 / (1.0 - 0.5 * RETURNING * (1.0 - np.cos(np.pi / 8.0 * np.array([1.0, 5.0, 3.0, 7.0]))))
-RELAXED_ROUNDS = 3  # of these steps: they leave a thirtieth, 0.02 mm of 0.7 after a read-out that was off by a fifth
+LEFT = 1 / 3
+MOST_ROUNDS = 3  # of these steps: they leave a thirtieth, 0.02 mm of 0.7 after a read-out that was off by a fifth
 SETTLED = 0.02  # px; a change of all features of a view by less moves its pose by less than their noise (0.3 px / 20)
 
 
@@ -121,9 +122,10 @@ class SparseMap:
 
     def settle(self, model: SparseModel) -> None:
         """As `adjust_globally`, until the shifts of features and the poses agree, also with another read-out."""
-        differs = abs(self.readout - model.settled_readout) > OTHER_READOUT * self.readout
-        if differs and self.readout and len(model) >= LONG_TRAJECTORY:  # in a shorter one the rows tell little
-            self._relax(model)
+        change = abs(self.readout - model.settled_readout)
+        if change > OTHER_READOUT * self.readout > 0.0 and len(model) >= LONG_TRAJECTORY:  # in others rows tell little
+            rounds = round(np.log(OTHER_READOUT * self.readout / change) / np.log(LEFT))  # until a small change is left
+            self._relax(model, min(max(rounds, 1), MOST_ROUNDS))
         self.adjust_globally(model, MAX_TURNS)
         model.settled_readout = self.readout
 
@@ -173,10 +175,10 @@ class SparseMap:
             if change < SETTLED:
                 return
 
-    def _relax(self, model: SparseModel) -> None:
+    def _relax(self, model: SparseModel, rounds: int) -> None:
         """Turns of shifts and poses, with steps of the shifts beyond what each one finds."""
         used = self.motions(model)
-        for step in RELAXED_ROUNDS * STEPS.tolist():
+        for step in rounds * STEPS.tolist():
             used = relaxed(used, row_motions(model, self.keyframes, self.readout), step)
             unroll(model, self.keyframes, used)
             adjust_model(model)
