@@ -6,9 +6,9 @@
 Every survey goes through the node graph and is kept in out/surveys: a run that was interrupted goes on where it was,
 the survey that was under way is done again. After each survey the tables (results/experiment_table_1.json to 7) are
 written anew from all that is there; of methods and overlaps of which no survey is kept they keep what they have. The
-figures (docs/images/experiment_figure_8 to 11) come last. The sites with the highest
-overlap come first. `--size 4k` films as the paper did: rendering then takes some 25 minutes of one core for a lab and
-an hour for a field site, and each survey several times what it takes at 720p.
+figures (docs/images/experiment_figure_8 to 11) come last. The sites with the highest overlap come first. `--size 4k`
+films as the paper did: rendering then takes some 25 minutes of one core for a lab and an hour for a field site, and
+each survey several times what it takes at 720p.
 """
 
 from __future__ import annotations
@@ -410,10 +410,10 @@ def _rows(layout: str, quantities: dict[str, Quantity], surveys: Surveys, earlie
         percent = round(100 * overlap)
         for name, quantity in quantities.items():
             paper = PAPER.get((layout, 100 * overlap), {}).get(name)
+            kept = before.get((percent, name), {})
             values = {
-                TITLES[method]: quantity(known) if known else before.get((percent, name), {}).get(TITLES[method])
-                for method in METHODS
-                for known in [surveys.get((method, overlap))]
+                title: quantity(known) if (known := surveys.get((method, overlap))) else kept.get(title)
+                for method, title in TITLES.items()
             }
             if paper is not None or any(value is not None for value in values.values()):
                 rows.append({"overlap [%]": percent, "quantity": name, "paper's figure": paper} | values)

@@ -151,6 +151,19 @@ def centre(camera_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
     return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
 
 
+def rates_of(before: NDArray[Any], now: NDArray[Any], after: NDArray[Any], tick: float) -> list[NDArray[np.float64]]:
+    """Linear and angular velocity and acceleration (3,) of the world as a camera sees it `now`, by differences.
+
+    Poses (4, 4), or their first three rows, camera_from_world, `tick` [s] apart.
+    """
+    rates = []
+    for rate in ((after - before) / (2 * tick), (after - 2 * now + before) / tick**2):
+        spin = rate[:3, :3] @ now[:3, :3].T
+        rates += [rate[:3, 3] - spin @ now[:3, 3], 0.5 * np.array([spin[2, 1], spin[0, 2], spin[1, 0]])]
+        rates[-1] -= 0.5 * np.array([spin[1, 2], spin[2, 0], spin[0, 1]])  # the antisymmetric part
+    return rates
+
+
 def position_errors(found: dict[int, NDArray[Any]], truth: dict[int, NDArray[Any]]) -> NDArray[np.float64]:
     """Distances from the true positions in metres after the best similarity (Umeyama, PAMI 1991)."""
     a = np.array([centre(found[stamp]) for stamp in found])

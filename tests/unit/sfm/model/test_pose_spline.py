@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scenes import rates_of
 from scipy.spatial.transform import Rotation
 
 from pipeprog_sfm.model.pose_spline import MIN_GAP, spline_rates
@@ -29,21 +30,11 @@ def path(times: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], NDArray
     return turns.as_matrix(), centres
 
 
-def true_rates(time: float) -> tuple[NDArray[np.float64], ...]:
+def true_rates(time: float) -> list[NDArray[np.float64]]:
     """As `spline_rates` of one view, by differences of the path."""
     rotations, centres = path(time + TICK * np.array([-1.0, 0.0, 1.0]))
-    poses = np.dstack([rotations, -rotations @ centres[..., None]])
-    poses = np.concatenate([poses, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (3, 1, 4))], axis=1)
-    moved = poses @ np.linalg.inv(poses[1])  # of the moment, from the camera of the stamp
-    velocity = (moved[2] - moved[0]) / (2 * TICK)
-    acceleration = (moved[2] - 2 * moved[1] + moved[0]) / TICK**2
-    return velocity[:3, 3], spin(velocity), acceleration[:3, 3], spin(acceleration)
-
-
-def spin(rate: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The vector of the antisymmetric part of a matrix."""
-    apart = 0.5 * (rate - rate.T)
-    return np.array([apart[2, 1], apart[0, 2], apart[1, 0]])
+    poses = np.concatenate([rotations, -rotations @ centres[..., None]], axis=2)
+    return rates_of(*poses, TICK)
 
 
 def test_the_rates_are_those_of_the_path() -> None:

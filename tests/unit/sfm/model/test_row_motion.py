@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenes import CAMERA, STEP, pose, position_errors, view
+from scenes import CAMERA, STEP, pose, position_errors, rates_of, view
 from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.camera import Camera
@@ -49,13 +49,8 @@ def turned(time: float) -> NDArray[np.float64]:
 
 def motion_at(time: float, path: Callable[[float], NDArray[np.float64]] = camera_at) -> RowMotion:
     """Velocities and accelerations of a path by differences."""
-    before, now, after = (path(time + step) for step in (-TICK, 0.0, TICK))
-    rates = []
-    for rate in ((after - before) / (2 * TICK), (after - 2 * now + before) / TICK**2):
-        spin = rate[:3, :3] @ now[:3, :3].T
-        rates += [rate[:3, 3] - spin @ now[:3, 3], 0.5 * np.array([spin[2, 1], spin[0, 2], spin[1, 0]])]
-        rates[-1] -= 0.5 * np.array([spin[1, 2], spin[2, 0], spin[0, 1]])  # the antisymmetric part
-    return RowMotion(READOUT, CAMERA.height, *rates)
+    poses = (path(time + step) for step in (-TICK, 0.0, TICK))
+    return RowMotion(READOUT, CAMERA.height, *rates_of(*poses, TICK))
 
 
 def walk(
