@@ -147,6 +147,9 @@ class SurveyNode(LifecycleNode):
     def destroy_node(self) -> None:
         """Ends the node as its user wishes: the next one is not active by itself."""
         self._takeover.end()
+        # Both are the node's own and rclpy leaves them: it would be in the graph for as long as Python keeps them.
+        self._action.destroy()
+        self._state_machine.destroy_when_not_in_use()
         super().destroy_node()
 
     def _on_goal(self, request: Survey.Goal) -> GoalResponse:
