@@ -36,7 +36,6 @@ class SparseModel:
         self.points: FloatArray = np.empty((0, 3))
         self.noise = INITIAL_NOISE
         self.adjusted_at = 2  # views at the last global adjustment
-        self.settled_readout = 0.0  # s, with which poses and the shifts of features were last made to agree
         self._rays: FloatArray = np.empty((0, 2))
         self._view_of: NDArray[np.int32] = np.empty(0, np.int32)
         self._point_of: IntArray = np.empty(0, np.int64)
@@ -109,11 +108,6 @@ class SparseModel:
         self.translation = np.concatenate([self.translation, camera_from_model[None, :3, 3]])
         self.focal = np.concatenate([self.focal, focal[None]])
         return view
-
-    def replace_camera(self, view: int, rays: FloatArray, focal: FloatArray) -> None:
-        """Gives a view the normalised coordinates (K, 2) of its features and the focal lengths of another camera."""
-        self._rays[self.features(view)] = rays
-        self.focal[view] = focal
 
     def link(self, features: IntArray, others: IntArray) -> None:
         """Turns matches of one view's features with features of other views (flat indices) into tracks.

@@ -148,22 +148,25 @@ class Mapper:
         return refine(model, keyframes, told, motions)
 
     def take_camera(self, refinement: Refinement) -> None:
-        """Goes on with a refined camera: the published model has its poses, all else is adjusted to it."""
+        """Goes on with a refined camera: the map grows again, from the features of its keyframes.
+
+        What another read-out has bent would come back from adjustment to adjustment (see `row_motion`), and matches
+        that another camera had rejected would stay out. Features and most matches are there: it takes seconds.
+        """
+        told, camera = refinement.told, refinement.camera
+        for stamp, keyframe in self._retired.items():
+            self._retired[stamp] = _with_camera(keyframe, told, camera)
+        keyframes = [_with_camera(keyframe, told, camera) for keyframe in self.map.keyframes.values()]
+        self.map.clear()
         self.map.readout = refinement.readout
-        model = self.map.published
-        for view, stamp in enumerate(model.stamps):
-            pose = refinement.poses[stamp]
-            model.rotation[view], model.translation[view] = pose[:3, :3], pose[:3, 3]
-        if refinement.camera != refinement.told:
-            for stamp, keyframe in self._retired.items():
-                self._retired[stamp] = keyframe.with_camera(refinement.camera)
-        self.map.replace_camera(refinement.told, refinement.camera)
+        for keyframe in keyframes:
+            self.add_features(keyframe.stamp, keyframe.measured_features(), keyframe.camera, keyframe.frame)
 
     def finish(self) -> None:
         """Tries the waiting keyframes once more and adjusts everything."""
         adjusted = []
         for model in self.map.models:
-            self.map.settle(model)
+            self.map.adjust_globally(model, MAX_TURNS)
             adjusted.append(list(model.stamps))
             for view in reversed(doubtful_views(model, self.map.keyframes) if self.map.readout else []):
                 if len(model) > 2:
@@ -261,7 +264,6 @@ class Mapper:
         self.map.revision += 1
         if self.map.readout:
             self.map.adjust_globally(best, MAX_TURNS)
-        best.settled_readout = self.map.readout
         self.map.waiting = [stamp for stamp in self.map.waiting if stamp not in best.stamps]
         return True
 
@@ -290,6 +292,11 @@ class Mapper:
 def _observations(model: SparseModel) -> int:
     """Number of features that have a point."""
     return int((model.point_of >= 0).sum())
+
+
+def _with_camera(keyframe: Keyframe, told: Camera, camera: Camera) -> Keyframe:
+    """A keyframe with another calibration in place of the one told."""
+    return keyframe.with_camera(camera) if keyframe.camera == told != camera else keyframe
 
 
 def _gap(model: SparseModel, stamp: int) -> int:

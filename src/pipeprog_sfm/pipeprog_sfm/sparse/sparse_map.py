@@ -8,30 +8,18 @@ from collections.abc import Collection
 import numpy as np
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
-from pipeprog_sfm.model.model_adjustment import adjust_model, adjust_points, pose_covariance
-from pipeprog_sfm.model.row_motion import LONG_TRAJECTORY, relaxed, row_motions, unroll
+from pipeprog_sfm.model.model_adjustment import adjust_model, pose_covariance
+from pipeprog_sfm.model.row_motion import row_motions, unroll
 from pipeprog_sfm.model.self_calibration import RADII, radial_residuals
 from pipeprog_sfm.model.sparse_model import SparseModel
-from pipeprog_sfm.sparse.guided_matching import link
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
 from pipeprog_sfm.sparse.registration import rejection_reason
 
 ERROR_SAMPLE = 20_000  # observations that give the mean error: with a spread of 1 px, to 1 / sqrt(20 000) = 0.007 px
 MAX_TURNS = 3  # of shifts and poses where they are to settle: see `row_motion`
-# Share by which a read-out differs from the one that shifts and poses agree with, from which on turns are not enough:
-# 2 % more leave 0.25 mm of a path where there were 0.20 (lab at 1.4 m/s, 20 ms).
-OTHER_READOUT = 0.02
-# Of what shifts and poses are off together up to this share comes back from turn to turn (the same lab: 0.94). Steps of
-# the shifts by Chebyshev's polynomial for shares from 0 to this one leave a third of it after four turns (Golub, Varga,
-# Numerische Mathematik 3, 1961). In this order the largest comes last; the turn after it is to take its noise away.
-RETURNING = 0.95
-STEPS = 1.0 / (1.0 - 0.5 * RETURNING * (1.0 - np.cos(np.pi / 8.0 * np.array([1.0, 5.0, 3.0, 7.0]))))
-LEFT = 1 / 3
-MOST_ROUNDS = 3  # of these steps: they leave a thirtieth, 0.02 mm of 0.7 after a read-out that was off by a fifth
 SETTLED = 0.02  # px; a change of all features of a view by less moves its pose by less than their noise (0.3 px / 20)
 
 
@@ -120,36 +108,16 @@ class SparseMap:
         model.adjusted_at = len(model)
         self.revision += 1
 
-    def settle(self, model: SparseModel) -> None:
-        """As `adjust_globally`, until the shifts of features and the poses agree, also with another read-out."""
-        change = abs(self.readout - model.settled_readout)
-        if change > OTHER_READOUT * self.readout > 0.0 and len(model) >= LONG_TRAJECTORY:  # in others rows tell little
-            rounds = round(np.log(OTHER_READOUT * self.readout / change) / np.log(LEFT))  # until a small change is left
-            self._relax(model, min(max(rounds, 1), MOST_ROUNDS))
-        self.adjust_globally(model, MAX_TURNS)
-        model.settled_readout = self.readout
-
     def put_back(self, model: SparseModel, view: int) -> None:
         """Takes a view out of its model, to wait again."""
         self.waiting.append(model.stamps[view])
         self.remove_view(model, view)
 
-    def replace_camera(self, told: Camera, camera: Camera) -> None:
-        """Gives all keyframes of one calibration another one, or the same; points and poses are adjusted."""
-        for stamp, keyframe in self.keyframes.items():
-            if keyframe.camera == told != camera:
-                self.keyframes[stamp] = keyframe.with_camera(camera)
-        for model in self.models:
-            for view, stamp in enumerate(model.stamps):
-                model.replace_camera(view, self.keyframes[stamp].rays, self.keyframes[stamp].focal)
-            self._unroll(model)
-            adjust_points(model)
-            if camera != told:  # with another read-out alone, the poses refined with it are near enough for the tracks
-                self.adjust_globally(model, MAX_TURNS)
-            # Tracks that the wrong camera had cut or kept apart.
-            for view in range(len(model)):
-                link(model, view, self.keyframes)
-            self.adjust_globally(model, MAX_TURNS)
+    def clear(self) -> None:
+        """Takes all keyframes out."""
+        for held in (self.keyframes, self.waiting, self.models, self.matches):
+            held.clear()
+        self.revision += 1
 
     def spline_motions(self, model: SparseModel, readout: float) -> dict[int, RowMotion]:
         """As `motions`, by the poses and a read-out [s] alone: velocities that rows correct take up its error, too."""
@@ -174,14 +142,6 @@ class SparseMap:
             adjust_model(model)
             if change < SETTLED:
                 return
-
-    def _relax(self, model: SparseModel, rounds: int) -> None:
-        """Turns of shifts and poses, with steps of the shifts beyond what each one finds."""
-        used = self.motions(model)
-        for step in rounds * STEPS.tolist():
-            used = relaxed(used, row_motions(model, self.keyframes, self.readout), step)
-            unroll(model, self.keyframes, used)
-            adjust_model(model)
 
     def camera_from_model(self) -> dict[int, FloatArray]:
         """Poses (4, 4) of the published model's keyframes, in order of time."""
