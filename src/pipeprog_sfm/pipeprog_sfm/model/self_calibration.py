@@ -43,7 +43,9 @@ STEP = 1e-6  # of numerical derivatives by rays, k1 and k2: a forward difference
 HELD = 1e-9  # standard deviation of a number that stays as it is
 # s, below which all rows count as exposed at once: 0.3 px at walking pace, and the fastest rolling shutters take 2 ms.
 LEAST_READOUT = 0.001
-READOUT_SHARE = 0.01  # of a read-out in use, below which a change does not matter: 0.05 px at walking pace
+# px, root mean square of the moves of features by a change of the read-out in use, below which it does not matter: the
+# change of a pose is less than their noise makes of it (0.3 px / 20).
+LEAST_MOVE = 0.02
 RADII = 8  # equal areas of the image, as rings, in which residuals are averaged
 MIN_IN_RING = 100  # residuals of a ring: their mean is known to a twentieth of a pixel
 
@@ -240,7 +242,7 @@ def refine(
     if free[3]:
         problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD), readout > 0)
         change, readout_sigma = _readout_change(problem, model, np.where(free, offset, 0.0))
-        least = READOUT_SHARE * readout if readout else LEAST_READOUT
+        least = LEAST_MOVE / np.sqrt((rates**2).sum(axis=1).mean()) if readout else LEAST_READOUT
         noise = readout_sigma if readout != told.readout else SIGNIFICANT * readout_sigma
         free[3] = readout + change > 0 and abs(change) > max(noise, least)
         if free[3] and not readout:  # what a rolling shutter bends looks like distortion: the camera's turn comes next
