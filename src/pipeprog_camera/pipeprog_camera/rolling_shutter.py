@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from pipeprog_camera.arrays import FloatArray
@@ -65,14 +66,15 @@ class RowMotion:
         measured = np.asarray(pixels, float).reshape(-1, 2)
         if self.readout == 0.0:
             return measured
-        times = self.row_times(camera.distort_points(measured)[:, 1])[:, None]
-        rays = np.c_[(measured - [camera.cx, camera.cy]) / [camera.fx, camera.fy], np.ones(len(measured))]
-        back = -(self.angular + 0.5 * self.angular_acceleration * times) * times
-        rays = _turned(back, rays)
-        shifts = _turned(back, (self.linear + 0.5 * self.linear_acceleration * times) * times)
-        # The point lies on the ray of its own moment; the length on it follows from its depth at the stamp.
-        lengths = (np.asarray(depths, float) + shifts[:, 2]) / rays[:, 2]
-        return _projected(lengths[:, None] * rays - shifts, camera)
+        focal, centre = [camera.fx, camera.fy], [camera.cx, camera.cy]
+        times = self.row_times(camera.distort_points(measured)[:, 1])
+        known = np.broadcast_to(np.asarray(depths, float), times.shape)
+        return self.unrolled_rays((measured - centre) / focal, times, known) * focal + centre
+
+    def unrolled_rays(self, rays: FloatArray, times: FloatArray, depths: FloatArray) -> FloatArray:
+        """As `unrolled_pixels`, of (N, 2) normalised image coordinates whose rows are exposed `times` (N,) s later."""
+        rates = self.linear, self.angular, 0.5 * self.linear_acceleration, 0.5 * self.angular_acceleration
+        return np.asarray(_unrolled(rays, times, depths, np.stack(rates)))
 
 
 def check_readout(readout: float) -> None:
@@ -84,13 +86,38 @@ def check_readout(readout: float) -> None:
         )
 
 
-def _projected(points: FloatArray, camera: Camera) -> FloatArray:
-    return points[:, :2] / points[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+@njit(cache=True, nogil=True)
+def _unrolled(rays, times, depths, rates):  # type: ignore[no-untyped-def]  # compiled
+    """(N, 2) normalised image coordinates at the stamp of those (N, 2) of rows `times` (N,) after it.
+
+    rates (4, 3): linear and angular velocity, and half of the accelerations.
+    """
+    found = np.empty_like(rays)
+    for n in range(len(rays)):
+        time = times[n]
+        shift = (rates[0] + rates[2] * time) * time
+        back = -(rates[1] + rates[3] * time) * time
+        ray_x, ray_y, ray_z = _turned(back, rays[n, 0], rays[n, 1], 1.0)
+        shift_x, shift_y, shift_z = _turned(back, shift[0], shift[1], shift[2])
+        # The point lies on the ray of its own moment; the length on it follows from its depth at the stamp.
+        length = (depths[n] + shift_z) / ray_z
+        depth = length * ray_z - shift_z
+        found[n, 0], found[n, 1] = (length * ray_x - shift_x) / depth, (length * ray_y - shift_y) / depth
+    return found
 
 
-def _turned(turns: FloatArray, points: FloatArray) -> FloatArray:
-    """(N, 3) points turned by (N, 3) rotation vectors (Rodrigues)."""
-    angle = np.linalg.norm(turns, axis=1)[:, None]
-    cross = np.cross(turns, points)
-    half = np.sinc(angle / (2 * np.pi))
-    return points + np.sinc(angle / np.pi) * cross + 0.5 * half * half * np.cross(turns, cross)
+@njit(cache=True, nogil=True)
+def _turned(turn, x, y, z):  # type: ignore[no-untyped-def]  # compiled
+    """A point turned by a rotation vector (Rodrigues)."""
+    a, b, c = turn
+    angle = np.sqrt(a * a + b * b + c * c)
+    whole = np.sin(angle) / angle if angle > 0.0 else 1.0
+    half = np.sin(0.5 * angle) / (0.5 * angle) if angle > 0.0 else 1.0
+    first_x, first_y, first_z = b * z - c * y, c * x - a * z, a * y - b * x
+    second_x, second_y, second_z = b * first_z - c * first_y, c * first_x - a * first_z, a * first_y - b * first_x
+    twice = 0.5 * half * half
+    return (
+        x + whole * first_x + twice * second_x,
+        y + whole * first_y + twice * second_y,
+        z + whole * first_z + twice * second_z,
+    )

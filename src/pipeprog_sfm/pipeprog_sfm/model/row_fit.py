@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
@@ -86,7 +87,8 @@ def fit_rows(
         return RowFit(prior, np.zeros(6), np.zeros((6, 6)), np.ones(6), sigma)
     camera = keyframe.camera
     measured = keyframe.measured[features].astype(np.float64)
-    times = prior.row_times(camera.distort_points(measured)[:, 1])[:, None, None]
+    times = prior.row_times(camera.distort_points(measured)[:, 1])
+    rays = (measured - [camera.cx, camera.cy]) / keyframe.focal
     precision = np.repeat([1.0, 1.0 / float(np.median(inside[:, 2])) ** 2], 3)
     held = precision / sigma**2
     if bend_sigmas is not None and bend_sigmas.all():  # two poses tell no acceleration
@@ -94,15 +96,9 @@ def fit_rows(
     moved = np.zeros(len(held))
     fitted = prior
     for _ in range(MAX_STEPS):
-        x, y, z = inside.T
-        shown = np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
-        error = fitted.unrolled_pixels(measured, z, camera) - shown
-        by_point = np.zeros((len(z), 2, 3))
-        by_point[:, 0, 0], by_point[:, 1, 1] = camera.fx / z, camera.fy / z
-        by_point[:, 0, 2], by_point[:, 1, 2] = -camera.fx * x / z**2, -camera.fy * y / z**2
-        by_pose = np.concatenate([np.cross(inside[:, None], by_point), by_point], axis=2)
-        columns = [by_pose, times * by_pose, 0.5 * times**2 * by_pose][: 1 + len(held) // 6]
-        rows = np.concatenate(columns, axis=2).reshape(2 * len(z), -1)
+        depths = inside[:, 2]
+        error = (fitted.unrolled_rays(rays, times, depths) - inside[:, :2] / depths[:, None]) * keyframe.focal
+        rows = _derivatives(inside, times, keyframe.focal, 1 + len(held) // 6)
         weights = 1.0 / (1.0 + (error**2).sum(axis=1) / (RAYLEIGH_MEDIAN * noise) ** 2) / noise**2
         weighted = (np.repeat(weights, 2)[:, None] * rows).T
         information = weighted @ rows
@@ -134,3 +130,20 @@ def _changed(motion: RowMotion, by: FloatArray) -> RowMotion:
         angular_acceleration=motion.angular_acceleration + twist,
         linear_acceleration=motion.linear_acceleration + bend,
     )
+
+
+@njit(cache=True, nogil=True)
+def _derivatives(inside, times, focal, blocks):  # type: ignore[no-untyped-def]  # compiled
+    """(2 K, 6 blocks) of the pixels of points (K, 3), by pose, velocity and acceleration (turn and shift each)."""
+    found = np.empty((2 * len(inside), 6 * blocks))
+    for k in range(len(inside)):
+        x, y, z = inside[k]
+        u, v, time = x / z, y / z, times[k]
+        across = (-u * y, z + u * x, -y, 1.0, 0.0, -u)
+        down = (-z - v * y, v * x, x, 0.0, 1.0, -v)
+        for block in range(blocks):
+            power = 1.0 if block == 0 else time if block == 1 else 0.5 * time * time
+            for n in range(6):
+                found[2 * k, 6 * block + n] = power * focal[0] / z * across[n]
+                found[2 * k + 1, 6 * block + n] = power * focal[1] / z * down[n]
+    return found
