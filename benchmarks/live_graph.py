@@ -40,6 +40,7 @@ PERIOD = 0.1  # s between two images
 DEFERRED = 1.0  # s for the decision on an image: the selector takes 10 ms
 ATTEMPTS = 20  # to send a goal: a node that is started anew is active a moment later
 ANSWER = 5.0  # s for the answer to a goal: none comes from a node that is not there
+SILENT = 10.0  # s without feedback, of which two a second come
 PATIENCE = 600.0  # s for what takes a minute on an idle machine
 
 
@@ -140,7 +141,7 @@ class Robot:
         """
         self._graph, self._frames, self._patient = graph, frames, patient
         self._chosen = self._answered = 0  # keyframes
-        self._is_over, self._shown_at = False, 0.0
+        self._is_over, self._shown_at, self._feedback_at = False, 0.0, 0.0
         self.feedback: list[Survey.Feedback] = []
         self._handle: ClientGoalHandle | None = None
         self._node = Node("robot")
@@ -169,19 +170,24 @@ class Robot:
             assert self._called(self._state, ChangeState.Request(transition=Transition(id=step))).success
 
     def survey(self, name: str, each: Callable[[], None] = lambda: None) -> Any:
-        """Walks once, and returns the answer of the action; `each` is called again and again meanwhile."""
+        """Walks once, and returns the answer of the action; `each` is called again and again meanwhile.
+
+        A request for the result is lost while the node that was started anew has not found this one yet, and is
+        sent again where nothing is heard.
+        """
         self.feedback.clear()
         self._place, self._shown, self._decided = -1, 0, 0
         self._chosen = self._answered = 0
         self._is_over = False
         over, ended = self._asked_for(name), False
         while True:
-            lives = self._graph.starts["survey"]
+            lives, asked = self._graph.starts["survey"], time.monotonic()
             self.wait_for(
-                lambda over=over, ended=ended, lives=lives: (  # type: ignore[misc]
+                lambda over=over, ended=ended, lives=lives, asked=asked: (  # type: ignore[misc]
                     over.done()
                     or self._graph.starts["survey"] > lives
                     or (not ended and self._is_filming() and self.is_at_the_end)
+                    or self._is_silent(asked)
                 ),
                 each,
             )
@@ -189,6 +195,8 @@ class Robot:
                 over, ended = self._asked_for(name), False
             elif over.done():
                 return over.result()
+            elif self._is_silent(asked) and self._handle is not None:
+                over = self._handle.get_result_async()
             else:
                 ended = self._has_ended()
 
@@ -196,6 +204,14 @@ class Robot:
         """Cancels the survey that runs; its answer tells what became of that."""
         if self._handle is not None:
             self._handle.cancel_goal_async()
+
+    def _is_silent(self, since: float) -> bool:
+        """Whether nothing has been heard of the survey for some time, nor since a moment."""
+        return time.monotonic() > max(since, self._feedback_at) + SILENT
+
+    def _on_feedback(self, heard: Any) -> None:
+        self._feedback_at = time.monotonic()
+        self.feedback.append(heard.feedback)
 
     def _has_ended(self) -> bool:
         """Whether the node has ended filming; a node that dies meanwhile gives no answer."""
@@ -208,9 +224,7 @@ class Robot:
         """The future of a goal's answer, sent until it is accepted."""
         for _ in range(ATTEMPTS):
             self.wait_for(self._client.server_is_ready)
-            sent = self._client.send_goal_async(
-                Survey.Goal(survey_id=name), lambda heard: self.feedback.append(heard.feedback)
-            )
+            sent = self._client.send_goal_async(Survey.Goal(survey_id=name), self._on_feedback)
             waited = time.monotonic() + ANSWER
             self.wait_for(lambda sent=sent, waited=waited: sent.done() or time.monotonic() > waited)  # type: ignore[misc]
             if sent.done() and sent.result().accepted:

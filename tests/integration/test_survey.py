@@ -44,6 +44,7 @@ BOARD_SEEN = slice(3, 19)  # frames from the first that shows the whole board
 COARSE = {"stereo.width": 640, "fusion.voxel": 0.006}  # the graph is tested here, not its accuracy
 TIMEOUT = 240.0  # s, for whatever takes seconds on an idle machine
 ANSWER = 2.0  # s for the answer to a goal: none comes from a node that is not there
+SILENT = 10.0  # s after which a result is asked for again
 PERIOD = 0.1  # s between two images
 MODULES = {"frames": "pipeprog_frames.node", "sfm": "pipeprog_sfm.node", "detect": "pipeprog_detect.node"} | {
     "survey": "pipeprog_bringup.survey.node"
@@ -136,9 +137,14 @@ class Mission:
         return self.feedback[-1]
 
     def result(self, handle: Any) -> Any:
-        future = handle.get_result_async()
-        self.wait_for(future.done)
-        return future.result()
+        """The answer to a goal, asked for again and again: a node that was started anew may not have heard it."""
+        deadline = time.monotonic() + TIMEOUT
+        while time.monotonic() < deadline:
+            future, waited = handle.get_result_async(), time.monotonic() + SILENT
+            self.wait_for(lambda future=future, waited=waited: future.done() or time.monotonic() > waited)  # type: ignore[misc]
+            if future.done():
+                return future.result()
+        raise AssertionError("no result")
 
     def _film(self) -> None:
         """An image of the walk, which goes on once one of its place was decided on: live images get lost."""

@@ -101,13 +101,22 @@ class SurveyClient:
         began = time.monotonic()  # nothing is heard while nobody waits
         while not self.wait(lambda: self.is_over, PAUSE):
             is_silent = time.monotonic() > max(self._heard, began) + SILENT_SECONDS
-            if is_silent and not self._is_taken_up():
+            if is_silent and not self._is_answered() and not self._is_taken_up():
                 self._result = None
                 return Surveyed(False, f"the node {self._name} is gone, and its survey with it", "")
         answer = self._result.result()
         succeeded = answer.status == GoalStatus.STATUS_SUCCEEDED
         error = answer.result.error_msg or ("" if succeeded else "the survey was cancelled")
         return Surveyed(succeeded, error, answer.result.folder)
+
+    def _is_answered(self) -> bool:
+        """Whether the node has the result: a request for it is lost while the node has not found this client yet."""
+        assert self._handle is not None
+        asked = self._handle.get_result_async()
+        if not self.wait(asked.done, PAUSE) or asked.result().status == GoalStatus.STATUS_UNKNOWN:
+            return False  # one that was started anew does not know the goal
+        self._result = asked
+        return True
 
     def _is_taken_up(self) -> bool:
         """Whether the survey goes on: it is heard of again, or the node takes the goal once more."""

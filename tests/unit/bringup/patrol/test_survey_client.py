@@ -6,6 +6,7 @@ from __future__ import annotations
 import pytest
 import rclpy
 from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
 from spot_msgs.action import NavigateTo
 
@@ -46,6 +47,29 @@ def test_filming_is_ended_once_more_where_the_node_was_killed_before_it_answered
             client.end()
         assert client.result() == Surveyed(True, "", "/surveys/monday")
         assert robot.said == ["survey monday", "survey monday", "end"]
+        client.close()
+
+
+class Deaf(ActionClient):
+    """Its first request for a result is lost."""
+
+    is_lost = True
+
+    def _get_result_async(self, handle: ClientGoalHandle) -> Future:
+        lost, self.is_lost = self.is_lost, False
+        return Future() if lost else super()._get_result_async(handle)
+
+
+@pytest.mark.parametrize("name", ["monday", ""])
+def test_a_result_is_asked_for_again_where_the_request_was_lost(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(survey_client, "SILENT_SECONDS", 1.0)
+    monkeypatch.setattr(survey_client, "ActionClient", Deaf)
+    with fake_robot() as robot:
+        client = SurveyClient(rclpy.create_node("mission"))
+        client.start(name)
+        client.end()
+        assert client.result() == Surveyed(True, "", f"/surveys/{name}")
+        assert robot.said == [f"survey {name}", "end"]
         client.close()
 
 
