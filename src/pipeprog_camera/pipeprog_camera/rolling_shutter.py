@@ -68,13 +68,12 @@ class RowMotion:
             return measured
         focal, centre = [camera.fx, camera.fy], [camera.cx, camera.cy]
         times = self.row_times(camera.distort_points(measured)[:, 1])
-        known = np.broadcast_to(np.asarray(depths, float), times.shape)
-        return self.unrolled_rays((measured - centre) / focal, times, known) * focal + centre
+        return self.unrolled_rays((measured - centre) / focal, times, np.asarray(depths, float)) * focal + centre
 
     def unrolled_rays(self, rays: FloatArray, times: FloatArray, depths: FloatArray) -> FloatArray:
         """As `unrolled_pixels`, of (N, 2) normalised image coordinates whose rows are exposed `times` (N,) s later."""
         rates = self.linear, self.angular, 0.5 * self.linear_acceleration, 0.5 * self.angular_acceleration
-        return np.asarray(_unrolled(rays, times, depths, np.stack(rates)))
+        return np.asarray(_unrolled(rays, times, np.ascontiguousarray(depths), np.stack(rates)))
 
 
 def check_readout(readout: float) -> None:

@@ -242,9 +242,10 @@ def refine(
     if free[3]:
         problem = _Problem(model, camera, chosen, rates, np.where(free, told.sigmas, HELD), readout > 0)
         change, readout_sigma = _readout_change(problem, model, np.where(free, offset, 0.0))
-        least = LEAST_MOVE / np.sqrt((rates**2).sum(axis=1).mean()) if readout else LEAST_READOUT
+        moved = abs(change) * float(np.sqrt((rates**2).sum(axis=1).mean()))  # px
+        matters = moved > LEAST_MOVE if readout else abs(change) > LEAST_READOUT
         noise = readout_sigma if readout != told.readout else SIGNIFICANT * readout_sigma
-        free[3] = readout + change > 0 and abs(change) > max(noise, least)
+        free[3] = readout + change > 0 and matters and abs(change) > noise
         if free[3] and not readout:  # what a rolling shutter bends looks like distortion: the camera's turn comes next
             free[:3] = False
     state, sigmas = _State(model.rotation, model.translation, model.points, np.zeros(4)), told.sigmas
