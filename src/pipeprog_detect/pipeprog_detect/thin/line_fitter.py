@@ -17,6 +17,7 @@ from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.refinement.contour_refinement import Start, refine
 from pipeprog_detect.refinement.extension import HIDDEN, where_seen
 from pipeprog_detect.silhouette.apparent_contour import ViewArrays
+from pipeprog_detect.silhouette.chromaticity import DISPLACED
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, mean_centre
@@ -85,7 +86,7 @@ class LineFitter:
         centre = mean_centre(start, self.views)
         at_depth = None if centre is None else at_cloud_depth(start, self.points, centre, False)
         rough = [(start, min(depth_sigma, DEPTH_REACH))] + ([] if at_depth is None else [(at_depth, LINE_DEPTH_SIGMA)])
-        error = self._radius_error(start)
+        error = self._metres(self.displaced, start)
         starts = [
             Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True, radius_error=error)
             for each, sigma in rough
@@ -126,7 +127,9 @@ class LineFitter:
         if self._accepts(here, known, PARALLEL_CONVINCING):
             return _of_both(fit, here)
         weaker = Scene.of(here.cylinder, self.views, known).own_support().weaker_share
-        return fit if self._has_planned_radius(here) or min(here.support, weaker) < CONVINCING else None
+        # Shadows and highlights within a blur of an edge move it by about as much as mixed pixels do in colour.
+        shaded = replace(here, radius_sigma=float(np.hypot(here.radius_sigma, self._metres(DISPLACED, here.cylinder))))
+        return fit if self._has_planned_radius(shaded) or min(here.support, weaker) < CONVINCING else None
 
     def in_direction(self, start: Cylinder, known: Sequence[Cylinder]) -> list[ContourFit]:
         """The accepted fits of a whole pipe: in the direction of `start`, and, from there, near this direction."""
@@ -174,17 +177,16 @@ class LineFitter:
         fit = refine(start, self.views, known, self.radii, follow)
         if fit is None or not self.displaced:
             return fit
-        error = self._radius_error(fit.cylinder)
+        error = self._metres(self.displaced, fit.cylinder)
         spread = max(_spread_of_sights(fit.cylinder, self.views), error / LINE_DEPTH_SIGMA)
         covariance = fit.covariance.copy()
         covariance[1, 1] += (error / spread) ** 2
         covariance[4, 4] += error**2
         return replace(fit, covariance=covariance, radius_sigma=float(np.sqrt(covariance[4, 4])))
 
-    def _radius_error(self, cylinder: Cylinder) -> float:
-        """Standard deviation [m] of what the edges of these images are off, at the distance of a cylinder."""
-        gain = float(np.median(ViewArrays.of(self.views).pixels_per_metre(cylinder.middle)))
-        return self.displaced / gain
+    def _metres(self, pixels: float, cylinder: Cylinder) -> float:
+        """What a length in these images [px] is at the distance of a cylinder [m]."""
+        return pixels / float(np.median(ViewArrays.of(self.views).pixels_per_metre(cylinder.middle)))
 
     def _accepts(self, fit: ContourFit, known: Sequence[Cylinder], least: tuple[float, float]) -> bool:
         """Whether the fit has a planned radius, the contour of a pipe on both sides, and moves as a cylinder's does.
