@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import random
@@ -22,7 +21,6 @@ from action_msgs.msg import GoalStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
@@ -35,7 +33,7 @@ from pipeprog_msgs.action import Survey
 from pipeprog_msgs.msg import FrameDecision, SiteProgress
 from pipeprog_node import messages, qos
 from pipeprog_sfm.alignment.map_file import MAP_FILE, read_map
-from tests.access import Access, allowed, used
+from tests.access import Access, allowed, observer, used
 from tests.fuzz.absurd_goals import absurd_goal, is_named
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -246,23 +244,6 @@ def sendable_goals(count: int, seed: int) -> Iterator[dict[str, Any]]:
         if abs(goal["time_limit"]) < 2**31 and not any("\0" in text for text in texts):
             yield goal
             count -= 1
-
-
-@contextlib.contextmanager
-def observer() -> Iterator[Node]:
-    """A node that joins the graph now.
-
-    Of a process that it has not heard for 20 s, the lease of Fast DDS, a node finds the topics again, but never again
-    which of its nodes uses them.
-    """
-    context = Context()
-    rclpy.init(context=context)
-    node = Node("observer", context=context)
-    try:
-        yield node
-    finally:
-        node.destroy_node()
-        rclpy.shutdown(context=context)
 
 
 def unlike_the_policy(mission: Mission, names: GraphNames, unused: Access) -> tuple[set[Access], set[Access]]:

@@ -141,9 +141,9 @@ def _derivatives(inside, times, focal, blocks):  # type: ignore[no-untyped-def] 
         u, v, time = x / z, y / z, times[k]
         across = (-u * y, z + u * x, -y, 1.0, 0.0, -u)
         down = (-z - v * y, v * x, x, 0.0, 1.0, -v)
+        powers = (1.0, time, 0.5 * time * time)
         for block in range(blocks):
-            power = 1.0 if block == 0 else time if block == 1 else 0.5 * time * time
             for n in range(6):
-                found[2 * k, 6 * block + n] = power * focal[0] / z * across[n]
-                found[2 * k + 1, 6 * block + n] = power * focal[1] / z * down[n]
+                found[2 * k, 6 * block + n] = powers[block] * focal[0] / z * across[n]
+                found[2 * k + 1, 6 * block + n] = powers[block] * focal[1] / z * down[n]
     return found

@@ -7,13 +7,10 @@ import time
 from pathlib import Path
 
 import pytest
-import rclpy
 from action_msgs.msg import GoalStatus
 from lifecycle_msgs.msg import Transition
 from rclpy.action import GoalResponse
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 
@@ -21,6 +18,7 @@ from pipeprog_bringup.survey import node as survey_node
 from pipeprog_bringup.survey.survey_journal import Unfinished
 from pipeprog_msgs.action import Survey
 from pipeprog_msgs.srv import Finish
+from tests.access import observer
 from tests.unit.bringup.survey.fake_graph import TICK
 from tests.unit.bringup.survey.survey_stage import SurveyStage, survey_stage
 
@@ -28,22 +26,15 @@ TIMEOUT = 60.0  # s for what other processes hear within one
 
 
 def test_a_node_that_is_destroyed_leaves_the_graph(tmp_path: Path) -> None:
-    context = Context()
-    rclpy.init(context=context)
-    observer = Node("observer", context=context)
-
-    def is_seen() -> bool:
-        return "survey" in observer.get_node_names()
-
-    with survey_stage(tmp_path / "surveys") as stage:
-        stage.until(is_seen)
-        stage.activate()
-    deadline = time.monotonic() + TIMEOUT
-    while is_seen() and time.monotonic() < deadline:
-        rclpy.spin_once(observer, executor=SingleThreadedExecutor(context=context), timeout_sec=TICK)
-    assert not is_seen()
-    observer.destroy_node()
-    rclpy.shutdown(context=context)
+    with observer() as node:
+        executor = SingleThreadedExecutor(context=node.context)
+        with survey_stage(tmp_path / "surveys") as stage:
+            stage.until(lambda: "survey" in node.get_node_names())
+            stage.activate()
+        deadline = time.monotonic() + TIMEOUT
+        while "survey" in node.get_node_names() and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=TICK)
+        assert "survey" not in node.get_node_names()
 
 
 @pytest.mark.parametrize(
