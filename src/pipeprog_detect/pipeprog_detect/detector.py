@@ -45,6 +45,9 @@ _STEREO_ON_PIPES = 2.0
 _WALL_SPACING = 0.01
 # Pipes up to 1.5 times as thick as the thickest planned one are looked for: a wrong size on site is to be seen.
 _THICKEST = 1.5
+# Stereo first compares windows of this width [px], at a quarter of the size of the images: of a pipe that is narrower,
+# the cloud may show something else at another depth, such as what it reflects.
+_STEREO_WINDOW = 20.0
 # A camera in a sewer may be in a pipe that is thinner than planned, too, by up to 30 %.
 _THINNEST_BORE = 0.7
 
@@ -180,7 +183,7 @@ def detect_outside(
     report(0.95, "looking for thin pipes in the keyframes")
     measured = longer_in_colour(measured, THICKEST_LINE, coloured)
     edges = memory.edges if memory else {}
-    lost = find_thin_pipes(points, around, THICKEST_LINE, measured, judging, boq, edges)
+    lost = find_thin_pipes(points, around, max(THICKEST_LINE, _narrowest(judging)), measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
     measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)
     measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
@@ -226,6 +229,16 @@ def _with_blur(views: Sequence[View], measured: Sequence[MeasuredPipe]) -> list[
     """The views with the blur that the contours of thick pipes show: on a thin one it is not told from the width."""
     blurs = [each.fit.blur for each in measured if each.fit is not None and each.cylinder.radius >= THICKEST_LINE]
     return [replace(view, blur=float(np.median(blurs))) for view in views] if blurs else list(views)
+
+
+def _narrowest(views: Sequence[View]) -> float:
+    """Radius [m] of a pipe that most views show as wide as a window of stereo, as far away as what they see; or 0."""
+    radii = [
+        0.5 * _STEREO_WINDOW * float(np.median(view.nearest[np.isfinite(view.nearest)])) / view.camera.fx
+        for view in views
+        if view.nearest is not None and np.isfinite(view.nearest).any()
+    ]
+    return float(np.median(radii)) if radii else 0.0
 
 
 def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequence[View]) -> list[MeasuredPipe]:

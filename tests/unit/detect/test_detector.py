@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -21,7 +22,10 @@ from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable
 from pipeprog_detect.verification.scene_context import SceneContext
+from sitegen.primitives import cylinder as cylinder_of
+from sitegen.site import PIPE_MATERIALS
 from tests.unit.detect.pipe_and_wall import PIPE, wall_points
+from tests.unit.detect.rendered_site import walk_past
 
 CONFIG = DetectConfig()
 NOISE = 2e-3
@@ -188,6 +192,34 @@ def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View],
     assert judged(measured, pipe_views) == measured[:1]
     assert judged(measured[:1], empty_views) == measured[:1]  # thick: the cloud shows it
     assert judged(measured, []) == measured
+
+
+@pytest.mark.parametrize(("scale", "found"), [(0.5, 1), (1.0, 0)])
+def test_a_thick_pipe_that_stereo_misses_is_found_by_its_lines_where_it_is_narrow(scale: float, found: int) -> None:
+    """14 px wide in the smaller images, 28 px in the others, where windows of stereo lie within it."""
+    pipe = Cylinder(np.array([-0.4, -0.07, 0.05]), np.array([0.4, -0.07, 0.05]), 0.0365)
+    blue = next(material for material in PIPE_MATERIALS if material.colour == (0.06, 0.17, 0.40))
+    views = [_reduced(view, scale) for view in walk_past([cylinder_of(pipe.start, pipe.end, pipe.radius, blue)])]
+    rng = np.random.default_rng(1)
+    wall = rectangle(rng, np.array([-1.5, 0.0, -0.5]), np.array([3.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.5]))
+    wall = wall[(np.abs(wall - pipe.middle) > [0.42, 1.0, 0.06]).any(axis=1)]
+    astray = pipe.at(rng.uniform(0.0, 1.0, 400)) + rng.uniform(-0.03, 0.03, (400, 3))
+    cloud = np.vstack([wall + rng.normal(0.0, 1e-3, wall.shape), astray])
+    pipes = detect(Cloud(cloud), BOQ, CONFIG, views)
+    assert len(pipes) == found
+    for each in pipes:
+        assert abs(each.cylinder.radius - pipe.radius) < 3.0 * each.radius_sigma
+        assert each.cylinder.length == pytest.approx(pipe.length, abs=0.02)
+
+
+def _reduced(view: View, scale: float) -> View:
+    camera = view.camera.scaled(scale)
+    assert view.chromaticity is not None
+    image, chromaticity = (
+        np.asarray(cv2.resize(each, (camera.width, camera.height), interpolation=cv2.INTER_AREA), np.uint8)
+        for each in (view.image, view.chromaticity)
+    )
+    return replace(view, camera=camera, image=image, chromaticity=chromaticity)
 
 
 @pytest.mark.parametrize(("length", "is_seen"), [(0.4, False), (0.16, True)])
