@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any
 
 import yaml
+from action_msgs.msg import GoalStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
@@ -179,9 +180,9 @@ class Robot:
         self._place, self._shown, self._decided = -1, 0, 0
         self._chosen = self._answered = 0
         self._is_over = False
-        over, ended = self._asked_for(name), False
+        over, ended, lives = self._asked_for(name), False, self._graph.starts["survey"]
         while True:
-            lives, asked = self._graph.starts["survey"], time.monotonic()
+            asked = time.monotonic()
             self.wait_for(
                 lambda over=over, ended=ended, lives=lives, asked=asked: (  # type: ignore[misc]
                     over.done()
@@ -191,8 +192,10 @@ class Robot:
                 ),
                 each,
             )
-            if self._graph.starts["survey"] > lives:  # it may have died before it noted that filming has ended
-                over, ended = self._asked_for(name), False
+            is_known = not over.done() or over.result().status != GoalStatus.STATUS_UNKNOWN
+            if self._graph.starts["survey"] > lives or not is_known:
+                # It may have died before it noted that filming has ended.
+                over, ended, lives = self._asked_for(name), False, self._graph.starts["survey"]
             elif over.done():
                 return over.result()
             elif self._is_silent(asked) and self._handle is not None:
