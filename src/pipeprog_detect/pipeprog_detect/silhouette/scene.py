@@ -39,8 +39,8 @@ MOSTLY_HIDDEN = 4
 OUTWARD, OUTWARD_OF_BLUR = 1.5, 3.0
 # Distance of the light's samples across the contour [px]: half of what an image resolves.
 STEP = 0.5
-# Blur of a sharp image, and the ones that are tried [px]: a pixel (0.29), linear interpolation between pixels (0.41) and
-# a lens whose image of a point is about a pixel wide (0.33), in squares.
+# Blur of a sharp image, and the ones that are tried [px]. In squares: a pixel (0.29), linear interpolation between
+# pixels (0.41) and a lens whose image of a point is about a pixel wide (0.33).
 SHARP = 0.6
 BLURS = np.array([0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.45, 1.75, 2.1, 2.5])
 # The blur is measured within this distance of the predicted contour [px], on about this many samples.
