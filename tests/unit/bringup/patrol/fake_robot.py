@@ -66,7 +66,8 @@ class FakeRobot(Node):
         if self._is_filming:  # as the node survey: a goal of the same name joins the survey that runs
             return GoalResponse.ACCEPT if goal.survey_id and goal.survey_id == self._filmed else GoalResponse.REJECT
         self._is_lost = self.is_killed and not self.said
-        self._is_filming, self._end_asked = True, self.is_killed and self.ends_itself and not self._is_lost
+        self._is_filming = not self._is_lost
+        self._end_asked = self.is_killed and self.ends_itself and not self._is_lost
         self.said.append(f"survey {goal.survey_id}")
         self._filmed = goal.survey_id
         return GoalResponse.ACCEPT
@@ -74,7 +75,6 @@ class FakeRobot(Node):
     def _survey(self, handle: Any) -> Survey.Result:
         name = handle.request.survey_id
         if self._is_lost:
-            self._is_filming = False
             while rclpy.ok() and len(self.said) < 2:
                 time.sleep(WAIT)
             return Survey.Result()
