@@ -45,8 +45,9 @@ _STEREO_ON_PIPES = 2.0
 _WALL_SPACING = 0.01
 # Pipes up to 1.5 times as thick as the thickest planned one are looked for: a wrong size on site is to be seen.
 _THICKEST = 1.5
-# Stereo first compares windows of this width [px], at a quarter of the size of the images: of a pipe that is narrower,
-# the cloud may show something else at another depth, such as what it reflects.
+# Stereo first compares windows of 5 px at a quarter of the size of its images, which is this width in them [px]: of a
+# narrower pipe the cloud may show something else at another depth, such as what it reflects. In keyframes larger than
+# stereo's images fewer pipes are that narrow.
 _STEREO_WINDOW = 20.0
 # A camera in a sewer may be in a pipe that is thinner than planned, too, by up to 30 %.
 _THINNEST_BORE = 0.7
@@ -183,7 +184,8 @@ def detect_outside(
     report(0.95, "looking for thin pipes in the keyframes")
     measured = longer_in_colour(measured, THICKEST_LINE, coloured)
     edges = memory.edges if memory else {}
-    lost = find_thin_pipes(points, around, max(THICKEST_LINE, _narrowest(judging)), measured, judging, boq, edges)
+    thickest = max(THICKEST_LINE, _radius_in_window(judging))
+    lost = find_thin_pipes(points, around, thickest, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
     measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)
     measured = _judged([parallel_to_wall(each, around) for each in measured], judging, is_supported)
@@ -231,8 +233,8 @@ def _with_blur(views: Sequence[View], measured: Sequence[MeasuredPipe]) -> list[
     return [replace(view, blur=float(np.median(blurs))) for view in views] if blurs else list(views)
 
 
-def _narrowest(views: Sequence[View]) -> float:
-    """Radius [m] of a pipe that most views show as wide as a window of stereo, as far away as what they see; or 0."""
+def _radius_in_window(views: Sequence[View]) -> float:
+    """Radius [m] of a pipe as wide as a window of stereo in the median view, at the median depth; 0 if not known."""
     radii = [
         0.5 * _STEREO_WINDOW * float(np.median(view.nearest[np.isfinite(view.nearest)])) / view.camera.fx
         for view in views
