@@ -96,8 +96,8 @@ class CameraInUse:
         self._looked = found
         if final and self.refined and np.isfinite(found.sigmas).any():
             return True  # that it differs has been decided, the last images only say it best
-        if found.camera == found.told:  # the read-out alone, which is refined where the images contradict it
-            return bool(found.changes[3]) and found.shift > FINAL_SHIFT
+        if found.camera == found.told:  # the read-out alone, which is refined where it matters to the poses
+            return bool(found.changes[3]) and (final or found.shift > FINAL_SHIFT)
         return found.is_significant and found.shift > (FINAL_SHIFT if final else EARLY_SHIFT)
 
     def accept(self, found: Refinement) -> None:

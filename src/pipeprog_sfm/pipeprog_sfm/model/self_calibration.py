@@ -43,9 +43,9 @@ STEP = 1e-6  # of numerical derivatives by rays, k1 and k2: a forward difference
 HELD = 1e-9  # standard deviation of a number that stays as it is
 # s, below which all rows count as exposed at once: 0.3 px at walking pace, and the fastest rolling shutters take 2 ms.
 LEAST_READOUT = 0.001
-# px, root mean square of the moves of features by a change of the read-out in use, below which it does not matter: the
-# change of a pose is less than their noise makes of it (0.3 px / 20).
-LEAST_MOVE = 0.02
+# px, root mean square of the moves of features by a change of the read-out in use, below which it does not matter: at
+# 20 ms and 1.4 m/s, 0.05 px (1 %) put a path off by 0.13 mm, and a fifth of it is less than the features' noise does.
+LEAST_MOVE = 0.01
 RADII = 8  # equal areas of the image, as rings, in which residuals are averaged
 MIN_IN_RING = 100  # residuals of a ring: their mean is known to a twentieth of a pixel
 
