@@ -119,18 +119,18 @@ def _consensus(views: list[BoardView], posed: PosedCamera, board: Board) -> tupl
     orders = symmetries(board)
     rows = posed.rows_at(views, [view.seen.centres for view in views])
     limits = np.array([_agreement(view, posed.camera, board) for view in views])[rows.groups]
+    sights = _sights(rows, posed.camera, len(views), len(board.centres))
     best, best_score = np.eye(4), (0, 0.0)
     best_inliers: NDArray[np.bool_] = np.zeros((len(orders), len(views)), bool)
     for (first, partner), order in product(_image_pairs(views, posed), orders):
-        start = _from_pair(rows, (first, partner), order, posed, board)
+        renumbered = np.empty_like(sights[partner])
+        renumbered[order] = sights[partner]
+        start = _from_pair(sights[first], renumbered, board) if first != partner else None
         if start is None:
             continue
         points = board.centres @ start[:3, :3].T + start[:3, 3]
         errors = np.stack(
-            [
-                np.linalg.norm(posed.project(rows, points[turn[rows.circles]])[0] - rows.pixels, axis=1)
-                for turn in orders
-            ]
+            [np.linalg.norm(posed.pixels(rows, points[turn[rows.circles]]) - rows.pixels, axis=1) for turn in orders]
         )
         inliers = np.stack([_all_in_group(error <= limits, rows.groups, len(views)) for error in errors])
         score = (int(inliers.any(0).sum()), -float(np.minimum(errors.min(0), limits).sum()))
@@ -165,25 +165,25 @@ def _all_in_group(good: NDArray[np.bool_], groups: NDArray[np.intp], count: int)
     return np.bincount(groups, ~good, count) == 0
 
 
-def _from_pair(
-    rows: CircleRows, pair: tuple[int, int], order: NDArray[np.intp], posed: PosedCamera, board: Board
-) -> FloatArray | None:
+def _sights(rows: CircleRows, camera: Camera, images: int, circles: int) -> FloatArray:
+    """(I, C, 2, 3) lines of sight to the circles in the images, origin and unit direction; NaN where not seen."""
+    rays = np.c_[rows.pixels, np.ones(len(rows.pixels))] @ np.linalg.inv(camera.matrix).T
+    rays = np.einsum("nji,nj->ni", rows.rotations, rays)
+    sights = np.full((images, circles, 2, 3), np.nan)
+    sights[rows.groups, rows.circles, 0] = -np.einsum("nji,nj->ni", rows.rotations, rows.translations)
+    sights[rows.groups, rows.circles, 1] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return sights
+
+
+def _from_pair(one: FloatArray, two: FloatArray, board: Board) -> FloatArray | None:
     """(4, 4) model_from_board from the circles that two images share; None where fewer than three can be triangulated.
 
-    `order` numbers the circles of the second image.
+    one, two: (C, 2, 3) lines of sight in each image, see `_sights`.
     """
-    one, two = rows.take(rows.groups == pair[0]), rows.take(rows.groups == pair[1])
-    common, in_one, in_two = np.intersect1d(one.circles, order[two.circles], return_indices=True)
-    if pair[0] == pair[1] or len(common) < 3:
+    common = np.flatnonzero(np.isfinite(one[:, 0, 0] + two[:, 0, 0]))
+    if len(common) < 3:
         return None
-    inverse = np.linalg.inv(posed.camera.matrix)
-    rays, origins = [], []
-    for part, chosen in ((one, in_one), (two, in_two)):
-        rotations = part.rotations[chosen]
-        ray = np.einsum("nji,nj->ni", rotations, np.c_[part.pixels[chosen], np.ones(len(chosen))] @ inverse.T)
-        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
-        origins.append(-np.einsum("nji,nj->ni", rotations, part.translations[chosen]))
-    points, depths, sines = midpoints(origins[0], rays[0], origins[1], rays[1])
+    points, depths, sines = midpoints(one[common, 0], one[common, 1], two[common, 0], two[common, 1])
     if sines.min() < MIN_SINE or depths.min() <= 0:
         return None
     return similarity(board.centres[common], points)

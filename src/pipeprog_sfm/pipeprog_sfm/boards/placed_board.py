@@ -110,11 +110,14 @@ class PosedCamera:
         circles = np.concatenate([view.seen.indices for view in views])
         return CircleRows(np.concatenate(pixels), circles, groups, stack[:, :3, :3], stack[:, :3, 3])
 
+    def pixels(self, rows: CircleRows, points: FloatArray) -> FloatArray:
+        """(M, 2) pixels of model points (M, 3) in the images of the rows."""
+        return self._shown(*_inside(rows, points))
+
     def project(self, rows: CircleRows, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels (M, 2) of model points (M, 3) in the images of the rows, and derivatives (M, 2, 3) by the points."""
         camera = self.camera
-        x, y, z = (np.einsum("nij,nj->ni", rows.rotations, points) + rows.translations).T
-        z = np.where(z > 1e-9, z, 1e-9)
+        x, y, z = _inside(rows, points)
         zero = np.zeros_like(z)
         by_camera = np.stack(
             [
@@ -123,4 +126,15 @@ class PosedCamera:
             ],
             axis=1,
         )
-        return np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], by_camera @ rows.rotations
+        return self._shown(x, y, z), by_camera @ rows.rotations
+
+    def _shown(self, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
+        """(M, 2) pixels of points in the cameras' frames."""
+        camera = self.camera
+        return np.c_[camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
+
+
+def _inside(rows: CircleRows, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coordinates (M,) of model points (M, 3) in the frames of the rows' cameras; the depth is positive."""
+    x, y, z = (np.einsum("nij,nj->ni", rows.rotations, points) + rows.translations).T
+    return x, y, np.where(z > 1e-9, z, 1e-9)
