@@ -85,11 +85,11 @@ ADVICE = {
         "mm, a scale 0.004 and 0.005 % and a camera path 0.11 and 0.17 mm off; 30 ms not told 6 of 6 with 0.118 mm, "
         "0.004 % and 0.15 mm; 30 ms told a fifth too long 6 of 6 with 0.049 mm, 0.005 % and 0.14 mm. With a global "
         "shutter the paths are 0.07 to 0.10 mm off.\n"
-        "Seed 117 (720p, 5 Hz), 20 ms at 1.4 m/s: told 6 of 6 with 0.152 mm, 0.004 % and a path 0.23 mm off; not told"
-        " 6 of 6 with 0.143 mm, 0.001 %, 0.24 mm and a read-out of 19.7 ms; told as 24 ms 6 of 6 with 0.134 mm, 0.003"
-        " %, 0.22 mm and 20.0 ms; with a global shutter 6 of 6 with 0.159 mm, 0.001 % and 0.07 mm. What is left is "
-        "the speed forwards, which five poses a second do not tell: where all that is seen lies at one depth, rolling"
-        " rows show it as a turn upwards and a lift.\n"
+        "Seed 117 (720p, 5 Hz), 20 ms at 1.4 m/s: told 6 of 6 with 0.152 mm, 0.004 % and a path 0.23 mm off; not "
+        "told 6 of 6 with 0.143 mm, 0.001 %, 0.24 mm and a read-out of 19.7 ms; told as 24 ms 6 of 6 with 0.134 mm, "
+        "0.003 %, 0.22 mm and 20.0 ms; with a global shutter 6 of 6 with 0.159 mm, 0.001 % and 0.07 mm. What is "
+        "left is the speed forwards, which five poses a second do not tell: where all that is seen lies at one "
+        "depth, rolling rows show it as a turn upwards and a lift.\n"
         "A field of 58 pipes (seed 125, 3 Hz), 15 ms at 0.72 m/s: told F 0.974, not told 0.965, with a global shutter "
         "0.973; its path is 0.56, 0.91 and 0.20 mm off, as 3 Hz do not follow a hand that sways at 1.7 Hz.",
     ),

@@ -125,7 +125,7 @@ def _consensus(views: list[BoardView], posed: PosedCamera, board: Board) -> tupl
     for (first, partner), order in product(_image_pairs(views, posed), orders):
         renumbered = np.empty_like(sights[partner])
         renumbered[order] = sights[partner]
-        start = _from_pair(sights[first], renumbered, board) if first != partner else None
+        start = _from_pair(sights[first], renumbered, board)
         if start is None:
             continue
         points = board.centres @ start[:3, :3].T + start[:3, 3]
@@ -177,6 +177,8 @@ def _sights(rows: CircleRows, camera: Camera, images: int, circles: int) -> Floa
 
 def _from_pair(one: FloatArray, two: FloatArray, board: Board) -> FloatArray | None:
     """(4, 4) model_from_board from the circles that two images share; None where fewer than three can be triangulated.
+
+    Two views of one image, which may show several boards, have no depth between them.
 
     one, two: (C, 2, 3) lines of sight in each image, see `_sights`.
     """
