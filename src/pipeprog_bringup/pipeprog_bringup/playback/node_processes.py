@@ -134,8 +134,7 @@ class Graph:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "PYTHONUNBUFFERED": "1"},
-                start_new_session=True,
-                preexec_fn=_die_with_parent,
+                preexec_fn=_prepare,
             )
 
     def _log(self, name: str) -> Path:
@@ -168,6 +167,11 @@ def _set_room_aside(log: BinaryIO) -> None:
     _LIBC.fallocate(log.fileno(), _FALLOC_FL_KEEP_SIZE, ctypes.c_int64(0), ctypes.c_int64(LOG_ROOM))
 
 
-def _die_with_parent() -> None:
+def _prepare() -> None:
+    """In the new process: its own group, in the session of the command, and it dies with its parent.
+
+    One session, as under `ros2 launch`: Linux gives each the same share of the processors (autogroups, sched(7)).
+    """
     assert _LIBC is not None
+    os.setpgid(0, 0)
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
