@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from time import monotonic
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,6 +71,10 @@ TICK = 1.0  # s
 # Ticks without a keyframe that a map contains, until the map does without. Both come from this machine or its network
 # within a second; ticks are counted, not seconds, so that a node that stood still first hears what waits for it.
 PATIENCE = 10
+# Since a keyframe came, after which a map that lacks the newest ones is not begun: one of all of them follows once the
+# SfM has caught up, which detection would delay. It is the SfM's HOLD_SECONDS.
+HOLD_SECONDS = 0.5
+UNPLACED = 2  # newest keyframes that a map may lack without another one to follow: the SfM has found no pose for them
 
 
 class CompleteMap(NamedTuple):
@@ -219,6 +224,7 @@ class DetectNode(Node):
         self._named: dict[str, Cylinder] = {}  # pipes by name, as they were published last
         self._numbers: dict[int, int] = {}  # of the keyframes handed to the worker, by stamp
         self._taken = 0  # keyframes handed to the worker, one that came again counted again
+        self._heard = monotonic()  # when the last keyframe came
         self._retired: list[tuple[int, ...]] = []  # stamps of each retirement handed to the worker
         self._left_out: dict[int, None] = {}  # stamps of keyframes that no map waits for, in their order
         self._waited: dict[int, int] = {}  # ticks, by stamp of the keyframes that the newest map waits for
@@ -267,6 +273,7 @@ class DetectNode(Node):
         self._left_out.pop(stamp, None)  # it was given up too early
         self._numbers[stamp] = self._supervision.keep(keyframe)
         self._taken += 1
+        self._heard = monotonic()
         self._retirements.keyframes_came(self._taken)
         self._hand_over()
 
@@ -301,7 +308,7 @@ class DetectNode(Node):
         status, poses, velocities = newest.status, newest.poses, newest.velocities
         asked = self._finish.expected is not None and status.revision >= self._finish.expected
         final = status.final or asked  # the final map may come before the request to finish, and is the same then
-        if not (self._intermediate or final):
+        if not final and (not self._intermediate or self._is_followed(poses)):
             return
         missing = self._missing(poses)
         if missing:
@@ -318,6 +325,17 @@ class DetectNode(Node):
             return
         self._in_work = status
         self._supervision.request(command)
+
+    def _is_followed(self, poses: ReceivedPoses) -> bool:
+        """Whether a map of more keyframes is expected soon: the SfM is behind, and no keyframe comes any more.
+
+        After PATIENCE it is not expected any more: the SfM may have missed keyframes.
+        """
+        silence = monotonic() - self._heard
+        if not HOLD_SECONDS < silence < PATIENCE * TICK:
+            return False
+        newest = int(poses.stamps.max(initial=0))
+        return sum(stamp > newest for stamp in self._numbers) > UNPLACED
 
     def _on_finish(self) -> None:
         self._answer_when_published()

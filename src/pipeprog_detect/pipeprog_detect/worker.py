@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -27,10 +26,6 @@ from pipeprog_detect.product.product import Product, product_of
 from pipeprog_detect.silhouette.board_faces import board_faces
 from pipeprog_detect.types import Cloud, Cylinder, View
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
-
-# Of the process: a tenth of the mapper's CPU share, and less than its depth maps have (5). While keyframes wait the map
-# comes first, since pipes of one that is not the last are soon replaced.
-NICENESS = 10
 
 
 @dataclass(frozen=True)
@@ -126,7 +121,6 @@ def serve(
     named: Mapping[str, Cylinder],
 ) -> None:
     """Works off commands from `connection` until it closes; a predecessor `kept` these and gave these names."""
-    os.nice(NICENESS)
     keyframes, identities, memory = Keyframes(), PipeTracker(named), MeasurementCache()
     for earlier in kept:
         _keep(earlier, keyframes, memory)

@@ -28,7 +28,7 @@ from pipeprog_camera.camera import Camera
 from pipeprog_camera.errors import InputError
 from pipeprog_detect.config import ContourConfig, DetectConfig
 from pipeprog_detect.detector import detect
-from pipeprog_detect.node import DetectNode
+from pipeprog_detect.node import PATIENCE, TICK, DetectNode
 from pipeprog_detect.product.boq import load_boq
 from pipeprog_detect.product.product import Product, product_of
 from pipeprog_detect.types import Cloud
@@ -215,6 +215,42 @@ def test_a_map_waits_for_its_keyframes(stage: Callable[..., Stage]) -> None:
     scene.spin_until(lambda: scene.pipes)
     assert scene.values()["keyframes"] == "2"
     assert scene.values()["pipes"] == "3"
+
+
+def test_a_map_without_the_newest_keyframes_is_not_begun_once_no_more_come(
+    stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map of all of them follows, but for the last ones, for which there may be no pose."""
+    now = 0.0
+    monkeypatch.setattr("pipeprog_detect.node.monotonic", lambda: now)
+    scene, stamps = stage(), [START + number * STEP for number in range(6)]
+    for stamp in stamps:
+        scene.send_image(stamp)
+        scene.send_calibration(stamp)
+    scene.spin_until(lambda: scene.values()["keyframes"] == "6")
+    now = 1.0
+    scene.send_map(stamps[2], 1, stamps[:3], corner())
+    assert [scene.values()["map revision"] for _ in range(2)] == ["0", "0"]
+    scene.send_map(stamps[3], 2, stamps[:4], corner())
+    scene.spin_until(lambda: scene.pipes)
+    assert scene.pipes[0].map_revision == 2
+
+
+@pytest.mark.parametrize("silence", [0.1, PATIENCE * TICK])
+def test_a_map_without_the_newest_keyframes_is_begun_while_more_come_or_if_none_follows(
+    stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch, silence: float
+) -> None:
+    now = 0.0
+    monkeypatch.setattr("pipeprog_detect.node.monotonic", lambda: now)
+    scene, stamps = stage(), [START + number * STEP for number in range(6)]
+    for stamp in stamps:
+        scene.send_image(stamp)
+        scene.send_calibration(stamp)
+    scene.spin_until(lambda: scene.values()["keyframes"] == "6")
+    now = silence
+    scene.send_map(stamps[2], 1, stamps[:3], corner())
+    scene.spin_until(lambda: scene.pipes)
+    assert scene.pipes[0].map_revision == 1
 
 
 def test_a_map_of_a_rolling_shutter_waits_for_its_velocities(stage: Callable[..., Stage]) -> None:
