@@ -13,11 +13,14 @@ from pipeprog_frames.overlap_feedback import BestBetween, OverlapReport, StreamF
 from pipeprog_frames.policy.keyframe_budget import KeyframeBudget
 from pipeprog_frames.policy.selector import FrameSelector
 
-UNLOADED_LAG = 5  # keyframes that the SfM may be behind without load: a bundle adjustment takes seconds at times
+# Keyframes that the SfM may be behind without load: two or three come during the adjustment of a large map (0.8 s).
+UNLOADED_LAG = 3
 # ns between two keyframes of a rolling shutter, whose velocities are those of a curve through their poses: a step sways
 # the camera at 1.7 Hz, which such a curve knows to a fifth at 0.2 s, and not at all at 0.3 s.
 MAX_GAP = 220_000_000
-FULL_LAG = 25  # keyframes behind at which the load counts as full: half of what the SfM's queue holds (50)
+# Keyframes behind at which the load counts as full. As many are worked off with a short queue as with a long one, and
+# what waits delays the last map: ten are 4 s of work on two cores.
+FULL_LAG = 10
 
 
 class KeyframeStream:
