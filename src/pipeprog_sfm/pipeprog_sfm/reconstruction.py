@@ -309,7 +309,7 @@ class Reconstruction:
             return False
         used = self._images[next(iter(poses))].camera
         waiting = bool(self._map.readout) and not final
-        found = self._mapper.self_calibration(self._camera.priors(used, waiting))
+        found = self._mapper.self_calibration(self._camera.priors(used, waiting), final)
         if found is None or not self._camera.is_better(found, final):
             return False
         images = {stamp: image for stamp, image in self._images.items() if image.camera == found.told}

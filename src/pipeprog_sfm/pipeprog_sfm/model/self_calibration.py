@@ -34,6 +34,9 @@ from pipeprog_sfm.model.row_motion import readout_rates
 from pipeprog_sfm.model.sparse_model import SparseModel
 
 MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map
+# The same while keyframes come: what matters then moves features by a pixel, and 24 views of so many points tell k1 to
+# 0.0003, a twentieth of that.
+EARLY_POINTS = 1000
 MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera that its depth does not take up
 DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with more, the prior has decided
 SIGNIFICANT = 5.0  # standard deviations of a change: features share errors that the covariance knows in part only
@@ -216,7 +219,11 @@ class _Reduced:
 
 
 def refine(
-    model: SparseModel, keyframes: Mapping[int, Keyframe], told: Priors, motions: Mapping[int, RowMotion]
+    model: SparseModel,
+    keyframes: Mapping[int, Keyframe],
+    told: Priors,
+    motions: Mapping[int, RowMotion],
+    points: int = MAX_POINTS,
 ) -> Refinement | None:
     """The camera refined on a model's observations; None where there are too few.
 
@@ -229,9 +236,10 @@ def refine(
         told: what was told of the camera.
         motions: of the views while their rows are read out with the read-out in use, by stamp; a view without one tells
             nothing of the read-out.
+        points: used at the most.
     """
     camera = keyframes[model.stamps[0]].camera
-    chosen = _sample(model)
+    chosen = _sample(model, points)
     if chosen is None:
         return None
     rates = readout_rates(model, keyframes, motions, chosen[2])
@@ -323,14 +331,14 @@ def radial_residuals(model: SparseModel, camera: Camera) -> FloatArray:
     return np.where(count >= MIN_IN_RING, mean, np.nan)
 
 
-def _sample(model: SparseModel) -> tuple[IntArray, IntArray, IntArray] | None:
-    """Observations of up to MAX_POINTS points with tracks of MIN_TRACK views, as `SparseModel.observations`."""
+def _sample(model: SparseModel, points: int) -> tuple[IntArray, IntArray, IntArray] | None:
+    """Observations of up to so many points with tracks of MIN_TRACK views, as `SparseModel.observations`."""
     count = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points))
     long = np.flatnonzero(count >= MIN_TRACK)
     if len(long) < MAX_POINTS // 20:
         return None
     wanted = np.zeros(len(model.points), bool)
-    wanted[long[np.unique(np.linspace(0, len(long) - 1, MAX_POINTS).astype(int))]] = True
+    wanted[long[np.unique(np.linspace(0, len(long) - 1, points).astype(int))]] = True
     return model.observations(wanted)
 
 

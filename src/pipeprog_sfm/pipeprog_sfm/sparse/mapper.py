@@ -18,7 +18,7 @@ from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
 from pipeprog_sfm.features.sift import Features, extract
 from pipeprog_sfm.model.row_motion import predicted_motion, row_motions, told_by_rows, unroll, unrolled_by
-from pipeprog_sfm.model.self_calibration import Priors, Refinement, refine
+from pipeprog_sfm.model.self_calibration import EARLY_POINTS, MAX_POINTS, Priors, Refinement, refine
 from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
@@ -135,8 +135,11 @@ class Mapper:
             if len(self._retired) > self._remembered:
                 del self._retired[next(iter(self._retired))]
 
-    def self_calibration(self, told: Priors) -> Refinement | None:
-        """The camera that the published model agrees with best; None where that is not known, or of several cameras."""
+    def self_calibration(self, told: Priors, final: bool) -> Refinement | None:
+        """The camera that the published model agrees with best; None where that is not known, or of several cameras.
+
+        final: for the final map, by more points.
+        """
         model, keyframes, motions = self.map.published, self.map.keyframes, {}
         if len({keyframes[stamp].camera for stamp in model.stamps}) != 1:
             return None
@@ -145,7 +148,7 @@ class Mapper:
         if self.map.readout and motions:
             model, keyframes = copy.deepcopy(model), dict(keyframes)
             unroll(model, keyframes, motions)
-        return refine(model, keyframes, told, motions)
+        return refine(model, keyframes, told, motions, MAX_POINTS if final else EARLY_POINTS)
 
     def take_camera(self, refinement: Refinement) -> None:
         """Goes on with a refined camera: the map grows again, from the features of its keyframes.

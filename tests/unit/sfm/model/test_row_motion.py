@@ -121,7 +121,7 @@ def test_a_read_out_that_was_a_fifth_off_leaves_no_trace() -> None:
     """Turns alone would leave the scene bent by it: shifts and poses agree with each other there."""
     told, truth = walk(READOUT, count=40)
     mapper, _ = walk(1.2 * READOUT, count=40)
-    found = mapper.self_calibration(UNKNOWN)
+    found = mapper.self_calibration(UNKNOWN, final=True)
     assert found is not None
     mapper.take_camera(replace(found, readout=READOUT))
     mapper.finish()
@@ -251,7 +251,7 @@ def test_without_the_readout_the_path_is_bent(not_told: tuple[Mapper, dict[int, 
 
 def test_a_readout_that_is_not_told_is_found(not_told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
     mapper, truth = copy.deepcopy(not_told)
-    found = mapper.self_calibration(UNKNOWN)
+    found = mapper.self_calibration(UNKNOWN, final=True)
     assert found is not None
     assert found.is_significant
     assert found.camera == CAMERA
@@ -268,7 +268,7 @@ def test_a_global_shutter_stays_one() -> None:
         mapper.add_features(n * STEP, view(camera_at(n * STEP * 1e-9), n), CAMERA)
     mapper.finish()
     poses = mapper.map.camera_from_model()
-    found = mapper.self_calibration(UNKNOWN)
+    found = mapper.self_calibration(UNKNOWN, final=True)
     assert found is not None
     assert found.readout == 0.0
     assert found.readout_sigma < 0.001
