@@ -14,7 +14,7 @@ GUIDED_RATIO = 0.9  # higher than RATIO: the epipolar segment excludes most wron
 MAX_DISTANCE = 0.7  # between unit descriptors (45 degrees are 0.77): of different places beyond
 SAME_PLACE = 4.0  # px: a second candidate this near is the same corner at another orientation or scale
 CELL = 24.0  # px, of the grid that guided matching searches: a few features each
-BESIDE = 1.0 + 1e-9  # of the distance from a line: whatever rounding does, a feature on it passes
+BESIDE = 1.0 + 1e-9  # of a squared distance from a line: whatever rounding does, a feature within it passes
 
 
 def match(descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], ratio: float = RATIO) -> MatchArray:
