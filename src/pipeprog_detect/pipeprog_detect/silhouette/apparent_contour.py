@@ -95,11 +95,11 @@ def project(view: View, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return pixel, depth
 
 
-def in_image(view: View, points: FloatArray) -> NDArray[np.bool_]:
-    """Mask (N,) of the points (N, 3) of the map that lie before the camera and within the image."""
+def in_image(view: View, points: FloatArray, margin: float = 0.0) -> NDArray[np.bool_]:
+    """Mask (N,) of the points (N, 3) of the map that lie before the camera and `margin` [px] within the image."""
     pixel, depth = project(view, points)
-    size = np.array([view.camera.width, view.camera.height])
-    return np.asarray((depth > NEAR_PLANE) & (pixel > 0).all(axis=1) & (pixel < size - 1).all(axis=1))
+    last = np.array([view.camera.width, view.camera.height]) - 1
+    return np.asarray((depth > NEAR_PLANE) & (pixel > margin).all(axis=1) & (pixel < last - margin).all(axis=1))
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,14 @@ from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import project
-from pipeprog_detect.silhouette.free_space import SPACING, free_stretches, is_empty_beside
+from pipeprog_detect.silhouette.free_space import EDGE, SPACING, free_stretches, is_empty_beside
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
-from tests.unit.detect.straight_ahead import looking_along_y
+from tests.unit.detect.straight_ahead import CAMERA, looking_along_y
 
+AWAY = 1.2  # m, of the axes from the cameras
 HALF, WALL = 0.8, 0.25  # m: half of the line's length, and how far behind it the wall is
 # What a cell of the depths covers at the pipe (10 mm), on both sides of an edge, and a step of the search [m]. Beside
 # that the pipe's own surface hides the axis beyond its end: by up to a radius, from aslant (45 deg at the most).
@@ -57,6 +58,16 @@ def test_a_gap_between_two_pipes_is_free(middle: float, gap: float, radius: floa
 @pytest.mark.parametrize("radius", [0.02, 0.06])
 def test_nothing_is_free_along_a_whole_pipe(radius: float) -> None:
     assert free_stretches(line(radius), seen(tube(-HALF, HALF, radius)), []) == []
+
+
+@pytest.mark.parametrize(("above_the_edge", "is_free"), [(0.0, False), (0.1, True)])
+def test_what_stereo_misses_at_the_edge_of_all_images_is_not_free(above_the_edge: float, is_free: bool) -> None:
+    """The barrel of a pipe that leaves them at the bottom is in the cloud down to `EDGE` of them, or to 0.1 m above."""
+    last = CAMERA.height - 1
+    edge, bottom = (-(row - CAMERA.cy) / CAMERA.fy * AWAY for row in (last - EDGE, last))
+    upright = tube(edge + above_the_edge, 0.4, 0.06)[:, [1, 2, 0]]
+    pipe = Cylinder(np.array([0.0, 0.0, bottom + 0.005]), np.array([0.0, 0.0, 0.4]), 0.06)
+    assert bool(free_stretches(pipe, seen(upright), [])) == is_free
 
 
 def test_what_stands_before_a_gap_is_no_barrel() -> None:
