@@ -117,10 +117,17 @@ def test_views_of_a_sudden_turn_follow_their_own_rows() -> None:
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
 
 
+@pytest.fixture(scope="module")
+def told_long() -> tuple[Mapper, dict[int, NDArray[Any]]]:
+    return walk(READOUT, count=40)
+
+
 @pytest.mark.parametrize(("factor", "grows_again"), [(1.2, True), (1.005, False)])
-def test_a_read_out_that_was_off_leaves_no_trace(factor: float, grows_again: bool) -> None:
+def test_a_read_out_that_was_off_leaves_no_trace(
+    told_long: tuple[Mapper, dict[int, NDArray[Any]]], factor: float, grows_again: bool
+) -> None:
     """Turns alone would leave the scene bent by a fifth: shifts and poses agree with each other there."""
-    told, truth = walk(READOUT, count=40)
+    told, truth = told_long
     mapper, _ = walk(factor * READOUT, count=40)
     found = mapper.self_calibration(UNKNOWN, final=True)
     assert found is not None
