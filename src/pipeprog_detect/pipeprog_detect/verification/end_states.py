@@ -39,7 +39,9 @@ def _end_in_views(
     posterior = end_posterior(cylinder, at_end, views, others)
     # A plane on which the end lies is one ahead of a slightly shorter pipe.
     shorter = cylinder.cut(ON_PLANE, cylinder.length - ON_PLANE)
-    wall = min((ahead for ahead in planes_ahead(shorter, at_end, context, views) if ahead > 0.0), default=np.inf)
+    wall = min(
+        (ahead for ahead in planes_ahead(shorter, at_end, context, views, others) if ahead > 0.0), default=np.inf
+    )
     sigma = posterior.sigma(max(wall - ON_PLANE, 0.0))
     if wall < 2.0 * ON_PLANE:
         return PipeEnd(sigma, "wall")

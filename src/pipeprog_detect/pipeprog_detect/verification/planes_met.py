@@ -8,6 +8,7 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.cloud.cylinder_fit import basis
 from pipeprog_detect.cloud.plane_segmentation import Plane
+from pipeprog_detect.types import Cylinder
 from pipeprog_detect.verification.scene_context import SceneContext
 
 # An axis meets a plane at more than 30 deg, or it runs along it.
@@ -20,6 +21,9 @@ SAME_PLANE = 0.05
 # A plane surrounds a pipe that passes it where its points lie in six of the eight sectors around the pipe, and no
 # farther than this from it [radii, m].
 SECTORS, CLOSED, CLOSE_RADII, CLOSE = 8, 6, 4.0, 0.05
+# A plane across the end of a pipe (cosine of 10 deg) is that end, a cap or what stereo makes of an opening, where it is
+# not larger than this many of the pipe's cross-sections: stereo spreads its edge by two centimetres.
+ACROSS, END_AREAS = float(np.cos(np.radians(10.0))), 2.0
 
 
 def distance_to(plane: Plane, place: FloatArray, direction: FloatArray) -> float | None:
@@ -28,6 +32,13 @@ def distance_to(plane: Plane, place: FloatArray, direction: FloatArray) -> float
     if abs(slope) < MEETS:
         return None
     return float(plane.offset - plane.normal @ place) / slope
+
+
+def is_end_of(plane: Plane, cylinder: Cylinder) -> bool:
+    """Whether a plane is no wall but what is seen of a cylinder's end."""
+    if abs(plane.normal @ cylinder.axis) < ACROSS or plane.area > END_AREAS * np.pi * cylinder.radius**2:
+        return False
+    return any(abs(plane.normal @ end - plane.offset) < SAME_PLANE for end in (cylinder.start, cylinder.end))
 
 
 def points_on(normal: FloatArray, place: FloatArray, context: SceneContext) -> FloatArray:

@@ -14,7 +14,14 @@ from pipeprog_detect.silhouette.apparent_contour import views_showing
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.planes_met import LEAST_POINTS, SAME_PLANE, distance_to, points_on, surrounds
+from pipeprog_detect.verification.planes_met import (
+    LEAST_POINTS,
+    SAME_PLANE,
+    distance_to,
+    is_end_of,
+    points_on,
+    surrounds,
+)
 from pipeprog_detect.verification.scene_context import SceneContext
 
 # Views that suffice to tell whether the pipe goes on.
@@ -46,7 +53,7 @@ def with_ends_on_walls(
     ends = []
     for at_end in (False, True):
         end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
-        nearest = min(planes_ahead(cylinder, at_end, context, views), default=0.0)
+        nearest = min(planes_ahead(cylinder, at_end, context, views, others), default=0.0)
         if nearest > 0.0 and (
             not _goes_on(cylinder, at_end, rims[at_end], nearest, views, others)
             or free_stretches(Cylinder(end, end + nearest * out, cylinder.radius), views, others, cylinder)
@@ -56,11 +63,18 @@ def with_ends_on_walls(
     return Cylinder(ends[0], ends[1], cylinder.radius)
 
 
-def planes_ahead(cylinder: Cylinder, at_end: bool, context: SceneContext, views: Sequence[View]) -> list[float]:
-    """How far [m] beyond an end, or before it, the axis meets the planes of the `context` that it may end at."""
+def planes_ahead(
+    cylinder: Cylinder, at_end: bool, context: SceneContext, views: Sequence[View], others: Sequence[Cylinder]
+) -> list[float]:
+    """How far [m] beyond an end, or before it, the axis meets the planes of the `context` that it may end at.
+
+    The ends of `others` are none of them.
+    """
     end, out = (cylinder.end, cylinder.axis) if at_end else (cylinder.start, -cylinder.axis)
     ahead: list[float] = []
     for plane in sorted(context.planes, key=lambda plane: -plane.area):
+        if any(is_end_of(plane, other) for other in others):
+            continue
         distance = _distance(end, out, cylinder, plane, context, views)
         # Small planes are pieces of large ones, whose position they tell less precisely.
         if distance is not None and all(abs(distance - other) > SAME_PLANE for other in ahead):

@@ -95,6 +95,17 @@ def test_nothing_goes_on_to_a_plane_that_is_not_there_or_runs_along(pipe_views: 
     assert along.length == pytest.approx(PIPE.length, abs=1e-9)
 
 
+@pytest.mark.parametrize(("radius", "end"), [(0.1, -0.1), (0.04, -0.25)])
+def test_nothing_goes_on_to_the_end_of_another_pipe(pipe_views: list[View], radius: float, end: float) -> None:
+    """What is seen there is as large as the end of a pipe of 0.1 m: beside one of 0.04 m it is a wall."""
+    beside = Cylinder(np.array([0.25, 0.0, -0.25]), np.array([0.25, 0.0, 0.3]), radius)
+    x, y = np.meshgrid(np.arange(-0.1, 0.1, 0.005), np.arange(-0.1, 0.1, 0.005))
+    disc = np.stack([x, y, np.zeros_like(x)], axis=-1)[np.hypot(x, y) < 0.1] + beside.start
+    seen = walls(Plane(np.array([0.0, 0.0, 1.0]), -0.25, np.pi * 0.1**2), disc)
+    same_or_longer = with_ends_on_walls(cut(0.1), NO_RIMS, seen, pipe_views, [*hiding(-0.4, -0.06), beside])
+    assert height_of_start(same_or_longer) == pytest.approx(end, abs=TOLERANCE)
+
+
 def test_one_centimetre_that_is_seen_tells_little_of_a_hidden_stretch(
     pipe_views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
