@@ -11,16 +11,22 @@ import numpy as np
 from pipeprog_detect.refinement.axial_evidence import axial_evidence
 from pipeprog_detect.refinement.extension import CERTAIN, LEAST
 from pipeprog_detect.refinement.pipe_ends import find_end
+from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
+
+# Stretches longer than this [m] that the views see through are none of a pipe. Beside what hides a barrel, and near its
+# ends, stereo loses less of it: 0.06 to 0.11 m on four pipes of two generated fields.
+SEEN_THROUGH = 0.2
 
 
 def with_grown_ends(measured: Sequence[MeasuredPipe], views: Sequence[View]) -> list[MeasuredPipe]:
     """The pipes without what they have grown by where that is certainly none of theirs.
 
     A pipe grows piece by piece, each time as far as its last piece tells: a line of the background in line with a side
-    leads it on. All that the contour shows beyond the cloud's cylinder tells together where it ends.
+    leads it on. All that the contour shows beyond the cloud's cylinder tells together where it ends. Where the views
+    see through much of it, the edges there are of something else in line with the pipe.
     """
     if not views:
         return list(measured)
@@ -40,7 +46,14 @@ def _cut(measured: MeasuredPipe, at_end: bool, views: Sequence[View], others: Se
     grown = whole.length - high if at_end else low
     if grown < LEAST or high - low < LEAST:
         return measured
-    evidence = axial_evidence(Scene.of(whole.cut(low, high), views, others), at_end, grown)
+    known = whole.cut(low, high)
+    through = _seen_through(known, whole, at_end, views, others)
+    if through < grown:
+        whole, grown = whole.lengthened(at_end, through - grown), through
+        measured = replace(measured, cylinder=whole)
+        if grown < LEAST:
+            return measured
+    evidence = axial_evidence(Scene.of(known, views, others), at_end, grown)
     if evidence is None:
         return measured
     along, total = evidence.beyond()
@@ -53,3 +66,12 @@ def _cut(measured: MeasuredPipe, at_end: bool, views: Sequence[View], others: Se
         shorter, rim = shorter.lengthened(at_end, end.position), end.odds
     rims = (measured.rims[0], rim) if at_end else (rim, measured.rims[1])
     return replace(measured, cylinder=shorter, rims=rims)
+
+
+def _seen_through(
+    known: Cylinder, whole: Cylinder, at_end: bool, views: Sequence[View], others: Sequence[Cylinder]
+) -> float:
+    """How far [m] beyond an end of its known part the views begin to see through a pipe; infinite: nowhere."""
+    start, end = (known.end, whole.end) if at_end else (known.start, whole.start)
+    stretches = free_stretches(Cylinder(start, end, known.radius), views, others, known)
+    return min((low for low, high in stretches if high - low > SEEN_THROUGH), default=np.inf)

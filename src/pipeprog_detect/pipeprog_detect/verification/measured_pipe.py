@@ -90,14 +90,15 @@ def joined(
     for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views, overlapping, context):
         best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
         cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
+        in_cloud = spanning([measured[piece].candidate.cylinder for piece in pieces], best=pieces.index(best))
         points = sum(measured[piece].candidate.points for piece in pieces)
         along = sorted(
             (float(end @ cylinder.axis), rim)
             for piece in (measured[number] for number in pieces)
             for end, rim in zip((piece.cylinder.start, piece.cylinder.end), piece.rims, strict=True)
         )
-        candidate, rims = replace(measured[best].candidate, points=points), (along[0][1], along[-1][1])
-        whole.append(MeasuredPipe(candidate, cylinder, measured[best].radius_sigma, rims))
+        candidate = replace(measured[best].candidate, cylinder=in_cloud, points=points)
+        whole.append(MeasuredPipe(candidate, cylinder, measured[best].radius_sigma, (along[0][1], along[-1][1])))
     return whole
 
 

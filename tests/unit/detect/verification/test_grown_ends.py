@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cylinder, View
+from pipeprog_detect.verification import grown_ends
 from pipeprog_detect.verification.grown_ends import with_grown_ends
-from tests.unit.detect.pipe_and_wall import PIPE
+from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
 from tests.unit.detect.verification.test_open_ends import measured
 from tests.unit.detect.verification.test_wall_ends import hiding
 
@@ -37,6 +39,18 @@ def test_without_views_all_stays() -> None:
 def test_what_the_contour_shows_stays(pipe_views: list[View]) -> None:
     whole = replace(measured(FOUND), cylinder=PIPE)
     assert with_grown_ends([whole], pipe_views) == [whole]
+
+
+@pytest.mark.parametrize(("least", "length"), [(0.05, 0.7), (0.2, 1.0)])
+def test_what_the_views_see_through_goes_where_it_is_long(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, least: float, length: float
+) -> None:
+    """Its contour is seen, but the cloud has only the upper 0.7 of the pipe, without holes: the wall lies beyond."""
+    monkeypatch.setattr(grown_ends, "SEEN_THROUGH", least)
+    found = PIPE.cut(0.3 * PIPE.length, PIPE.length)
+    views = with_depths(pipe_views, np.concatenate([wall_points(), front_points(found)]))
+    (pipe,) = with_grown_ends([replace(measured(found), cylinder=PIPE)], views)
+    assert pipe.cylinder.length == pytest.approx(length * PIPE.length, abs=0.02)
 
 
 def test_what_is_hidden_stays(pipe_views: list[View]) -> None:

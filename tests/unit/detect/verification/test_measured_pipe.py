@@ -34,6 +34,7 @@ def test_a_pipe_found_by_its_lines_and_in_the_cloud_is_one() -> None:
     assert found[1].cylinder.radius == long.cylinder.radius
     assert found[1].radius_sigma == long.radius_sigma
     assert found[1].candidate.points == 600
+    np.testing.assert_array_equal(found[1].candidate.cylinder.row, found[1].cylinder.row)  # the cloud shows both
     assert joined([], []) == []
 
 
