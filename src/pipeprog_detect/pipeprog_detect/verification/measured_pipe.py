@@ -90,7 +90,9 @@ def joined(
     for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views, overlapping, context):
         best = min(pieces, key=lambda piece: measured[piece].radius_sigma)
         cylinder = spanning([measured[piece].cylinder for piece in pieces], best=pieces.index(best))
-        in_cloud = spanning([measured[piece].candidate.cylinder for piece in pieces], best=pieces.index(best))
+        # Of a thin pipe the cloud shows too little to tell one piece from a line of something else.
+        shown = [piece for piece in pieces if piece == best or not measured[piece].candidate.blurred]
+        in_cloud = spanning([measured[piece].candidate.cylinder for piece in shown], best=shown.index(best))
         points = sum(measured[piece].candidate.points for piece in pieces)
         along = sorted(
             (float(end @ cylinder.axis), rim)
