@@ -20,7 +20,7 @@ from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.interior_search import find_concave
 from pipeprog_detect.product import classification
 from pipeprog_detect.product.boq import BillOfQuantities
-from pipeprog_detect.silhouette.occlusion import with_depths
+from pipeprog_detect.silhouette.occlusion import STEREO_WINDOW, with_depths
 from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.false_lines import is_false_line, is_one_step
 from pipeprog_detect.thin.hangers import is_hanger
@@ -45,10 +45,6 @@ _STEREO_ON_PIPES = 2.0
 _WALL_SPACING = 0.01
 # Pipes up to 1.5 times as thick as the thickest planned one are looked for: a wrong size on site is to be seen.
 _THICKEST = 1.5
-# Stereo first compares windows of 5 px at a quarter of the size of its images, which is this width in them [px]: of a
-# narrower pipe the cloud may show something else at another depth, such as what it reflects. In keyframes larger than
-# stereo's images fewer pipes are that narrow.
-_STEREO_WINDOW = 20.0
 # A camera in a sewer may be in a pipe that is thinner than planned, too, by up to 30 %.
 _THINNEST_BORE = 0.7
 
@@ -234,9 +230,13 @@ def _with_blur(views: Sequence[View], measured: Sequence[MeasuredPipe]) -> list[
 
 
 def _radius_in_window(views: Sequence[View]) -> float:
-    """Radius [m] of a pipe as wide as a window of stereo in the median view, at the median depth; 0 if not known."""
+    """Radius [m] of a pipe as wide as a window of stereo in the median view, at the median depth; 0 if not known.
+
+    Of a narrower pipe the cloud may show something else at another depth, such as what it reflects. In keyframes larger
+    than stereo's images fewer pipes are that narrow.
+    """
     radii = [
-        0.5 * _STEREO_WINDOW * float(np.median(view.nearest[np.isfinite(view.nearest)])) / view.camera.fx
+        0.5 * STEREO_WINDOW * float(np.median(view.nearest[np.isfinite(view.nearest)])) / view.camera.fx
         for view in views
         if view.nearest is not None and np.isfinite(view.nearest).any()
     ]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import ViewArrays, in_image, project
 from pipeprog_detect.silhouette.edge_support import MIN_SUPPORT
-from pipeprog_detect.silhouette.occlusion import BEFORE, cylinder_rows, hidden_by_cylinders
+from pipeprog_detect.silhouette.occlusion import BEFORE, STEREO_WINDOW, cylinder_rows, hidden_by_cylinders
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.silhouette.surface_texture import face_log_odds
 from pipeprog_detect.types import Cylinder, View
@@ -37,9 +37,6 @@ REFUTED = float(np.log(100.0))
 # A known part without holes tells that a stretch is none where it is this many times as long: after k times its length
 # without one the next is a hole with a probability of 1 / (k + 2) (Laplace's rule of succession), one in four.
 DENSE = 2.0
-# Nearer to the edge of an image than this [px] stereo shows nothing: it compares windows as wide. What the cloud shows
-# there is what other views have seen.
-EDGE = 20.0
 # Free stretches shorter than this [m] are left out: two cells of a view's depths.
 SHORTEST = 0.03
 
@@ -156,7 +153,8 @@ def _seen_at(
     if view.nearest is None:
         return np.empty(0, np.int64), np.empty(0), np.empty(0, np.float32)
     cell = view.camera.width / view.nearest.shape[1]
-    looked = np.flatnonzero(in_image(view, points, EDGE))
+    # Nearer to its edge an image gives stereo no window: what the cloud shows there is what other views have seen.
+    looked = np.flatnonzero(in_image(view, points, STEREO_WINDOW))
     pixel, depth = project(view, points[looked])
     told = (view.camera.fx * room > cell * depth) & ~hidden_by_cylinders(view, pixel, depth, others)
     looked, pixel, depth = looked[told], pixel[told], depth[told]

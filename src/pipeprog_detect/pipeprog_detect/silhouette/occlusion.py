@@ -26,6 +26,8 @@ AROUND = np.array([[True, True, True], [True, False, True], [True, True, True]])
 # A surface is hidden by what lies nearer by more than this [m]: stereo spreads depth edges by about a centimetre, and
 # clamps stand out from the pipe that they hold by up to two.
 BEFORE = 0.03
+# Width of what stereo compares first [px]: windows of 5 px at a quarter of the size of its images.
+STEREO_WINDOW = 20.0
 # Pixels by which other cylinders are grown: their poses are known to a pixel, an edge's window is two wide.
 MARGIN = 3.0
 

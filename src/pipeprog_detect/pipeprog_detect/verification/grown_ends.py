@@ -47,10 +47,12 @@ def _cut(measured: MeasuredPipe, at_end: bool, views: Sequence[View], others: Se
     if grown < LEAST or high - low < LEAST:
         return measured
     known = whole.cut(low, high)
-    through = _seen_through(known, whole, at_end, views, others)
+    through = _free_from(known, whole, at_end, views, others)
     if through < grown:
         whole, grown = whole.lengthened(at_end, through - grown), through
-        measured = replace(measured, cylinder=whole)
+        measured = replace(
+            measured, cylinder=whole, rims=(measured.rims[0], 0.0) if at_end else (0.0, measured.rims[1])
+        )
         if grown < LEAST:
             return measured
     evidence = axial_evidence(Scene.of(known, views, others), at_end, grown)
@@ -68,7 +70,7 @@ def _cut(measured: MeasuredPipe, at_end: bool, views: Sequence[View], others: Se
     return replace(measured, cylinder=shorter, rims=rims)
 
 
-def _seen_through(
+def _free_from(
     known: Cylinder, whole: Cylinder, at_end: bool, views: Sequence[View], others: Sequence[Cylinder]
 ) -> float:
     """How far [m] beyond an end of its known part the views begin to see through a pipe; infinite: nowhere."""

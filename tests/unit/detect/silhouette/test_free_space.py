@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.silhouette.apparent_contour import project
-from pipeprog_detect.silhouette.free_space import EDGE, SPACING, free_stretches, is_empty_beside
-from pipeprog_detect.silhouette.occlusion import with_depths
+from pipeprog_detect.silhouette.free_space import SPACING, free_stretches, is_empty_beside
+from pipeprog_detect.silhouette.occlusion import STEREO_WINDOW, with_depths
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from tests.unit.detect.pipe_and_wall import PIPE, front_points, wall_points
@@ -62,9 +62,9 @@ def test_nothing_is_free_along_a_whole_pipe(radius: float) -> None:
 
 @pytest.mark.parametrize(("above_the_edge", "is_free"), [(0.0, False), (0.1, True)])
 def test_what_stereo_misses_at_the_edge_of_all_images_is_not_free(above_the_edge: float, is_free: bool) -> None:
-    """The barrel of a pipe that leaves them at the bottom is in the cloud down to `EDGE` of them, or to 0.1 m above."""
+    """The barrel of a pipe that leaves them at the bottom is in the cloud down to stereo's last window, or 0.1 m above."""
     last = CAMERA.height - 1
-    edge, bottom = (-(row - CAMERA.cy) / CAMERA.fy * AWAY for row in (last - EDGE, last))
+    edge, bottom = (-(row - CAMERA.cy) / CAMERA.fy * AWAY for row in (last - STEREO_WINDOW, last))
     upright = tube(edge + above_the_edge, 0.4, 0.06)[:, [1, 2, 0]]
     pipe = Cylinder(np.array([0.0, 0.0, bottom + 0.005]), np.array([0.0, 0.0, 0.4]), 0.06)
     assert bool(free_stretches(pipe, seen(upright), [])) == is_free
