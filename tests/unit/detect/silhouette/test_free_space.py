@@ -62,7 +62,7 @@ def test_nothing_is_free_along_a_whole_pipe(radius: float) -> None:
 
 @pytest.mark.parametrize(("above_the_edge", "is_free"), [(0.0, False), (0.1, True)])
 def test_what_stereo_misses_at_the_edge_of_all_images_is_not_free(above_the_edge: float, is_free: bool) -> None:
-    """The barrel of a pipe that leaves them at the bottom is in the cloud down to stereo's last window, or 0.1 m above."""
+    """A pipe's barrel that leaves them at the bottom is in the cloud down to stereo's window, or 0.1 m above."""
     last = CAMERA.height - 1
     edge, bottom = (-(row - CAMERA.cy) / CAMERA.fy * AWAY for row in (last - STEREO_WINDOW, last))
     upright = tube(edge + above_the_edge, 0.4, 0.06)[:, [1, 2, 0]]
