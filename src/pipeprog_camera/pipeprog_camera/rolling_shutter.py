@@ -72,8 +72,13 @@ class RowMotion:
 
     def unrolled_rays(self, rays: FloatArray, times: FloatArray, depths: FloatArray) -> FloatArray:
         """As `unrolled_pixels`, of (N, 2) normalised image coordinates whose rows are exposed `times` (N,) s later."""
-        rates = self.linear, self.angular, 0.5 * self.linear_acceleration, 0.5 * self.angular_acceleration
-        return np.asarray(_unrolled(rays, times, np.ascontiguousarray(depths), np.stack(rates)))
+        return np.asarray(_unrolled(rays, times, np.ascontiguousarray(depths), self.rates))
+
+    @property
+    def rates(self) -> FloatArray:
+        """(4, 3) linear and angular velocity, and half of the linear and of the angular acceleration; for kernels."""
+        halves = 0.5 * self.linear_acceleration, 0.5 * self.angular_acceleration
+        return np.stack((self.linear, self.angular, *halves))
 
 
 def check_readout(readout: float) -> None:
@@ -93,28 +98,37 @@ def _unrolled(rays, times, depths, rates):  # type: ignore[no-untyped-def]  # co
     """
     found = np.empty_like(rays)
     for n in range(len(rays)):
-        time = times[n]
-        shift = (rates[0] + rates[2] * time) * time
-        back = -(rates[1] + rates[3] * time) * time
-        ray_x, ray_y, ray_z = _turned(back, rays[n, 0], rays[n, 1], 1.0)
-        shift_x, shift_y, shift_z = _turned(back, shift[0], shift[1], shift[2])
-        # The point lies on the ray of its own moment; the length on it follows from its depth at the stamp.
-        length = (depths[n] + shift_z) / ray_z
-        depth = length * ray_z - shift_z
-        found[n, 0], found[n, 1] = (length * ray_x - shift_x) / depth, (length * ray_y - shift_y) / depth
+        found[n] = unrolled_ray(rays[n, 0], rays[n, 1], times[n], depths[n], rates)
     return found
 
 
 @njit(cache=True, nogil=True)
-def _turned(turn, x, y, z):  # type: ignore[no-untyped-def]  # compiled
-    """A point turned by a rotation vector (Rodrigues)."""
-    a, b, c = turn
+def unrolled_ray(x, y, time, depth, rates):  # type: ignore[no-untyped-def]  # compiled
+    """One of `_unrolled`, for kernels."""
+    right = (rates[0, 0] + rates[2, 0] * time) * time
+    down = (rates[0, 1] + rates[2, 1] * time) * time
+    ahead = (rates[0, 2] + rates[2, 2] * time) * time
+    a = -(rates[1, 0] + rates[3, 0] * time) * time
+    b = -(rates[1, 1] + rates[3, 1] * time) * time
+    c = -(rates[1, 2] + rates[3, 2] * time) * time
+    # Rodrigues' formula: the point and the shift turned back.
     angle = np.sqrt(a * a + b * b + c * c)
     whole = np.sin(angle) / angle if angle > 0.0 else 1.0
     half = np.sin(0.5 * angle) / (0.5 * angle) if angle > 0.0 else 1.0
+    twice = 0.5 * half * half
+    ray_x, ray_y, ray_z = _turned(a, b, c, whole, twice, x, y, 1.0)
+    shift_x, shift_y, shift_z = _turned(a, b, c, whole, twice, right, down, ahead)
+    # The point lies on the ray of its own moment; the length on it follows from its depth at the stamp.
+    length = (depth + shift_z) / ray_z
+    there = length * ray_z - shift_z
+    return (length * ray_x - shift_x) / there, (length * ray_y - shift_y) / there
+
+
+@njit(cache=True, nogil=True)
+def _turned(a, b, c, whole, twice, x, y, z):  # type: ignore[no-untyped-def]  # compiled
+    """A point turned by a rotation vector of length t; whole: sin(t) / t; twice: (1 - cos(t)) / t^2."""
     first_x, first_y, first_z = b * z - c * y, c * x - a * z, a * y - b * x
     second_x, second_y, second_z = b * first_z - c * first_y, c * first_x - a * first_z, a * first_y - b * first_x
-    twice = 0.5 * half * half
     return (
         x + whole * first_x + twice * second_x,
         y + whole * first_y + twice * second_y,
