@@ -40,6 +40,9 @@ EARLY_POINTS = 1000
 MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera that its depth does not take up
 DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with more, the prior has decided
 SIGNIFICANT = 5.0  # standard deviations of a change: features share errors that the covariance knows in part only
+# Standard deviations by which one step contradicts a read-out that was told: velocities have followed it, so that a
+# step finds a third to a half of what is off (a read-out that was right was contradicted by up to 2.5).
+CONTRADICTED = 3.0
 MAX_ITERATIONS = 15  # of Levenberg-Marquardt; 3 to 6 for a calibration, up to 12 for a guess, are needed
 CONVERGED = 0.1  # of its standard deviation, change of each number at which the iterations end
 STEP = 1e-6  # of numerical derivatives by rays, k1 and k2: a forward difference errs by 1e-6, its rounding by 1e-7 px
@@ -252,8 +255,8 @@ def refine(
         change, readout_sigma = _readout_change(problem, model, np.where(free, offset, 0.0))
         moved = abs(change) * float(np.sqrt((rates**2).sum(axis=1).mean()))  # px
         matters = moved > LEAST_MOVE if readout else abs(change) > LEAST_READOUT
-        noise = readout_sigma if readout != told.readout else SIGNIFICANT * readout_sigma
-        free[3] = readout + change > 0 and matters and abs(change) > noise
+        least = 1.0 if readout != told.readout else CONTRADICTED if readout else SIGNIFICANT
+        free[3] = readout + change > 0 and matters and abs(change) > least * readout_sigma
         if free[3] and not readout:  # what a rolling shutter bends looks like distortion: the camera's turn comes next
             free[:3] = False
     state, sigmas = _State(model.rotation, model.translation, model.points, np.zeros(4)), told.sigmas
