@@ -23,7 +23,7 @@ from pipeprog_sfm.alignment.alignment import Alignment, align
 from pipeprog_sfm.alignment.placing import NotAlignedError
 from pipeprog_sfm.alignment.survey_map import MappedBoard, SurveyMap, sparse_part, thinned
 from pipeprog_sfm.boards.board_file import BoardFile
-from pipeprog_sfm.camera_in_use import CameraInUse, board_agrees, radial_warning
+from pipeprog_sfm.camera_in_use import FINAL_SHIFT, CameraInUse, board_agrees, radial_warning
 from pipeprog_sfm.config import NOT_TOLD, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, Registered, centre
@@ -42,6 +42,7 @@ from pipeprog_sfm.types import EncodedImage
 # Of read-out and poses in turns: velocities follow the poses, and a map made anew leaves a sixth to a half of the error
 # (20 ms told as 24 ms: 20.7, 20.2, 20.05, 19.97).
 READOUT_ROUNDS = 6
+EARLY_ROUNDS = 2  # of these while keyframes come: the next ones tell more than further rounds
 
 
 class NotMetricError(Exception):
@@ -155,7 +156,7 @@ class Reconstruction:
         for other, features in self._deblurrer.deblurred(stamp, self._images[stamp], poses, self._map.points_seen):
             self._mapper.replace_features(other, features)
         if self._camera.is_due(len(self._map.published)):
-            self._refine_camera(final=False)
+            self._settle_camera(final=False)
         return report
 
     def update_dense(self) -> None:
@@ -185,13 +186,8 @@ class Reconstruction:
     def finish(self) -> MetricMap:
         """Registers what still can be, adjusts everything, and makes the final map; raises NotMetricError."""
         self._mapper.finish()
-        for _ in range(READOUT_ROUNDS if self._camera.refines else 0):
-            before = self._map.readout
-            if not self._refine_camera(final=True):
-                break
-            self._mapper.finish()
-            if self._map.readout == before:
-                break
+        if self._camera.refines:
+            self._settle_camera(final=True)
         warnings = radial_warning(self._map.radial_residuals()), self._camera.readout_warning()
         self._camera_warning = "; ".join(filter(None, warnings))
         self._scaled = -1
@@ -302,6 +298,17 @@ class Reconstruction:
             raise NotMetricError(self._reason)
         return MetricMap(scale, trajectory, points, self._camera.refined)
 
+    def _settle_camera(self, final: bool) -> None:
+        """Refines the camera, with a rolling shutter in turns with the poses until the read-out stays."""
+        for _ in range(READOUT_ROUNDS if final else EARLY_ROUNDS):
+            before = self._map.readout
+            if not self._refine_camera(final):
+                return
+            if final:
+                self._mapper.finish()
+            if self._map.readout == before:
+                return
+
     def _refine_camera(self, final: bool) -> bool:
         """Goes on with the camera that the map says, where the boards agree; whether it does."""
         poses = self._map.camera_from_model()
@@ -318,20 +325,21 @@ class Reconstruction:
         measured = self._metric_tracker
         if found.camera != found.told:
             measured = measured.remeasured(((stamp, image.gray()) for stamp, image in images.items()), found.camera)
-        model = self._map.published
-        rolling, other = (
-            _rolling(model, self._map.spline_motions(model, each)) for each in (self._map.readout, found.readout)
-        )
-        before = self._metric_tracker.board_misfit(poses, rolling)
-        if not board_agrees(before, measured.board_misfit(found.poses, other)):
-            return False
+        if found.camera != found.told or found.shift > FINAL_SHIFT:  # boards do not tell less
+            model = self._map.published
+            rolling, other = (
+                _rolling(model, self._map.spline_motions(model, each)) for each in (self._map.readout, found.readout)
+            )
+            before = self._metric_tracker.board_misfit(poses, rolling)
+            if not board_agrees(before, measured.board_misfit(found.poses, other)):
+                return False
         self._camera.accept(found)
         if found.camera != found.told:
             self._metric_tracker = measured
             for stamp, image in images.items():
                 self._images[stamp] = EncodedImage(image.data, found.camera)
             self._deblurrer.replace_camera(found.camera)
-        self._mapper.take_camera(found)
+        self._mapper.take_camera(found, final)
         self._dense.change_camera(found.shift)
         return True
 

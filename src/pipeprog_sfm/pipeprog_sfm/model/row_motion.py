@@ -14,7 +14,8 @@ Features are shifted by velocity and depth to where a camera with all rows at th
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
 T seconds comes back through the velocities multiplied by pi * readout / T, a tenth where keyframes are 0.2 s apart and
 the read-out is 15 ms: three turns do. What bends the scene and the velocities that rows tell together comes back nearly
-as it was, though (0.94 of it, at 1.4 m/s). It is there after another read-out alone: the map has to grow anew then.
+as it was, though (0.94 of it, at 1.4 m/s). It is there after another read-out, and where a map has grown: turns by the
+spline alone undo it, before those in which rows correct.
 """
 
 from __future__ import annotations
@@ -197,7 +198,7 @@ def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatAr
     has = (own >= 0) & (depths > 0)
     if not has.any():
         return None
-    nearest = cKDTree(keyframe.measured[has]).query(keyframe.measured[~has])[1]
+    nearest = cKDTree(keyframe.measured[has], balanced_tree=False).query(keyframe.measured[~has])[1]
     depths[~has] = depths[has][nearest]
     return np.asarray(depths)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,13 +32,8 @@ RETRIES = 3  # waiting keyframes tried again with each new one: a constant cost,
 # Waiting keyframes of each camera that a new one may start a model with: a baseline grows within a second or two.
 START_CANDIDATES = 8
 REMEMBERED = 100  # retired keyframes whose features are kept in case they are added again: 60 MB
-# Of a keyframe that comes between two of a rolling shutter's which show the same: it is there for the velocities. These
-# points tell its pose to 0.3 mm, and a velocity over 0.4 s to 1 mm/s, by which no row moves by more than 0.01 mm.
-MOTION_FEATURES = 1000
-ALIKE = 0.5  # of the points of the one of two views that has fewer, from which on they show the same
-# px, moves of features by another read-out up to which the map is kept: half of what they have bent stays after the
-# next adjustment, less than 0.05 mm of a path that is known to 0.2 mm (measured, 20 ms at 1.4 m/s).
-SLIGHT_SHIFT = 0.2
+# px, moves of features by another read-out up to which the map is kept: every match passes the geometric checks.
+KEPT_SHIFT = 1.0
 
 
 @dataclass(frozen=True)
@@ -80,10 +75,7 @@ class Mapper:
         known = self._retired.pop(stamp, None)
         if known is not None:
             return self.add_features(stamp, known.measured_features(), camera, frame)
-        config = self._config
-        if self.map.readout and self._is_seen_around(stamp, frame):
-            config = replace(config, max_features=min(config.max_features, MOTION_FEATURES))
-        return self.add_features(stamp, self._extract(gray, camera, config), camera, frame)
+        return self.add_features(stamp, self._extract(gray, camera, self._config), camera, frame)
 
     def add_features(self, stamp: int, features: Features, camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe whose features are known; frame: of its camera."""
@@ -141,7 +133,7 @@ class Mapper:
     def self_calibration(self, told: Priors, final: bool) -> Refinement | None:
         """The camera that the published model agrees with best; None where that is not known, or of several cameras.
 
-        final: for the final map, by more points.
+        final: for the final map, by more points; with a rolling shutter, velocities leave more than few points do.
         """
         model, keyframes, motions = self.map.published, self.map.keyframes, {}
         if len({keyframes[stamp].camera for stamp in model.stamps}) != 1:
@@ -151,21 +143,20 @@ class Mapper:
         if self.map.readout and motions:
             model, keyframes = copy.deepcopy(model), dict(keyframes)
             unroll(model, keyframes, motions)
-        return refine(model, keyframes, told, motions, MAX_POINTS if final else EARLY_POINTS)
+        return refine(model, keyframes, told, motions, MAX_POINTS if final and not self.map.readout else EARLY_POINTS)
 
-    def take_camera(self, refinement: Refinement) -> None:
-        """Goes on with a refined camera.
+    def take_camera(self, refinement: Refinement, final: bool) -> None:
+        """Goes on with a refined camera; final: `finish` comes next.
 
-        A read-out that moves no feature by more than SLIGHT_SHIFT changes the map as it is. Else the map grows again,
-        from the features of its keyframes: matches that another camera had rejected would stay out, and what another
-        read-out has bent would come back from adjustment to adjustment (see `row_motion`). Features and most matches
-        are there: it takes seconds.
+        A read-out that moves no feature by more than KEPT_SHIFT keeps the map. Else it grows again, from the features
+        of its keyframes: matches that another camera had rejected would stay out. Features and most matches are there:
+        it takes seconds.
         """
         told, camera = refinement.told, refinement.camera
-        if self.map.readout and camera == told and refinement.shift < SLIGHT_SHIFT:
+        if self.map.readout and camera == told and refinement.shift < KEPT_SHIFT:
             self.map.readout = refinement.readout
-            for model in list(self.map.models):
-                self.map.adjust_globally(model)
+            for model in [] if final else list(self.map.models):
+                self.map.adjust_globally(model, by_spline=MAX_TURNS)
             return
         for stamp, keyframe in self._retired.items():
             self._retired[stamp] = _with_camera(keyframe, told, camera)
@@ -179,7 +170,7 @@ class Mapper:
         """Tries the waiting keyframes once more and adjusts everything."""
         adjusted = []
         for model in self.map.models:
-            self.map.adjust_globally(model, MAX_TURNS)
+            self.map.adjust_globally(model, MAX_TURNS, MAX_TURNS)
             adjusted.append(list(model.stamps))
             for view in reversed(doubtful_views(model, self.map.keyframes) if self.map.readout else []):
                 if len(model) > 2:
@@ -237,17 +228,6 @@ class Mapper:
         if len(model) >= GROWTH * model.adjusted_at:
             self.map.adjust_globally(model)
         return KeyframeReport(stamp, True, "", len(location.pairs), 0.0)
-
-    def _is_seen_around(self, stamp: int, frame: str) -> bool:
-        """Whether the views of its camera just before and after a keyframe share most of their points."""
-        model = self.map.published
-        own = [other for other in model.stamps if self.map.keyframes[other].frame == frame]
-        before, after = [other for other in own if other < stamp], [other for other in own if other > stamp]
-        if not before or not after:
-            return False
-        around = model.stamps.index(max(before)), model.stamps.index(min(after))
-        held = min(len(model.seen(view)) for view in around)
-        return bool(model.covisible(around[0])[around[1]] > ALIKE * held)
 
     def _neighbours(self, model: SparseModel, keyframe: Keyframe) -> IntArray:
         """The two views of its camera nearest in time, and the nearest one of each other camera of a rig."""

@@ -93,13 +93,19 @@ class SparseMap:
                 model.filter(*model.observations(np.ones(len(model.points), bool)))
         return retired
 
-    def adjust_globally(self, model: SparseModel, turns: int = 1) -> None:
+    def adjust_globally(self, model: SparseModel, turns: int = 1, by_spline: int = 0) -> None:
         """Adjusts all views of a model; views whose poses are rejected afterwards wait again.
 
-        turns: with a rolling shutter, of the shifts of features and the poses; a map that grows goes on at the next.
+        With a rolling shutter:
+
+        Args:
+            model: of this map.
+            turns: of the shifts of features and the poses; a map that grows goes on at the next.
+            by_spline: of these before, with the velocities of the poses alone: they undo what is bent (`row_motion`).
         """
         if self.readout:
-            self._adjust_rolling(model, turns)
+            self._adjust_rolling(model, by_spline, rows_correct=False)
+            self._adjust_rolling(model, turns, rows_correct=True)
         else:
             adjust_model(model)
         for view in reversed(range(len(model))):
@@ -131,14 +137,11 @@ class SparseMap:
         used = {stamp: self.keyframes[stamp].motion for stamp in model.stamps}
         return {stamp: motion for stamp, motion in used.items() if motion is not None}
 
-    def _unroll(self, model: SparseModel) -> float:
-        """Shifts the features of a model by how it moves now; see `unroll`."""
-        return unroll(model, self.keyframes, row_motions(model, self.keyframes, self.readout)) if self.readout else 0.0
-
-    def _adjust_rolling(self, model: SparseModel, turns: int) -> None:
-        """Finds the shifts of features and the poses in turns, until the shifts stay."""
+    def _adjust_rolling(self, model: SparseModel, turns: int, rows_correct: bool) -> None:
+        """Finds shifts of features and poses in turns, until the shifts stay; rows_correct: see `row_motions`."""
         for _ in range(turns):
-            change = self._unroll(model)
+            motions = row_motions(model, self.keyframes, self.readout, rows_correct=rows_correct)
+            change = unroll(model, self.keyframes, motions)
             adjust_model(model)
             if change < SETTLED:
                 return
