@@ -133,7 +133,8 @@ class Mapper:
     def self_calibration(self, told: Priors, final: bool) -> Refinement | None:
         """The camera that the published model agrees with best; None where that is not known, or of several cameras.
 
-        final: for the final map, by more points; with a rolling shutter, velocities leave more than few points do.
+        final: for the final map, by more points, unless it is of a rolling shutter: there, errors of the velocities are
+        larger than those of few points.
         """
         model, keyframes, motions = self.map.published, self.map.keyframes, {}
         if len({keyframes[stamp].camera for stamp in model.stamps}) != 1:
@@ -148,12 +149,13 @@ class Mapper:
     def take_camera(self, refinement: Refinement, final: bool) -> None:
         """Goes on with a refined camera; final: `finish` comes next.
 
-        A read-out that moves no feature by more than KEPT_SHIFT keeps the map. Else it grows again, from the features
-        of its keyframes: matches that another camera had rejected would stay out. Features and most matches are there:
-        it takes seconds.
+        Another read-out that moves no feature by more than KEPT_SHIFT keeps the map. Else it grows again, from the
+        features of its keyframes: matches that another camera had rejected would stay out. Features and most matches
+        are there: it takes seconds.
         """
         told, camera = refinement.told, refinement.camera
-        if self.map.readout and camera == told and refinement.shift < KEPT_SHIFT:
+        is_rolling = self.map.readout > 0.0 and refinement.readout > 0.0
+        if is_rolling and camera == told and refinement.shift < KEPT_SHIFT:
             self.map.readout = refinement.readout
             for model in [] if final else list(self.map.models):
                 self.map.adjust_globally(model, by_spline=MAX_TURNS)

@@ -257,6 +257,15 @@ def test_a_readout_that_is_not_told_is_found(not_told: tuple[Mapper, dict[int, N
     assert position_errors(mapper.map.camera_from_model(), truth).max() < 2e-3
 
 
+def test_a_read_out_that_was_none_leaves_no_motion(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
+    """However little it moves the features: they are as the images have them again."""
+    mapper = copy.deepcopy(told[0])
+    found = mapper.self_calibration(UNKNOWN, final=True)
+    assert found is not None
+    mapper.take_camera(replace(found, camera=CAMERA, readout=0.0, shift=0.5 * KEPT_SHIFT), final=True)
+    assert mapper.map.motions(mapper.map.published) == {}
+
+
 def test_a_global_shutter_stays_one() -> None:
     mapper = Mapper(MapperConfig())
     for n in range(7):
