@@ -39,15 +39,10 @@ class RolledImage:
 
     @cached_property
     def numbers(self) -> FloatArray:
-        """fx, fy, cx, cy, s per row, s of row 0 after the stamp, rates (4 x 3); for kernels.
-
-        Rates are linear and angular velocity, and half of the linear and of the angular acceleration.
-        """
+        """fx, fy, cx, cy, s per row, s of row 0 after the stamp, `RowMotion.rates` (4 x 3); for kernels."""
         first, second = self.motion.row_times([0.0, 1.0])
         lens = [self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy]
-        motion = self.motion
-        halves = 0.5 * motion.linear_acceleration, 0.5 * motion.angular_acceleration
-        return np.concatenate([lens, [second - first, first], motion.linear, motion.angular, *halves])
+        return np.concatenate([lens, [second - first, first], self.motion.rates.ravel()])
 
     @property
     def rows(self) -> FloatArray:

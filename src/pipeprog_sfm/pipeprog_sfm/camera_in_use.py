@@ -8,13 +8,10 @@ import numpy as np
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import CalibrationConfig
-from pipeprog_sfm.model.self_calibration import RADII, Priors, Refinement, numbers_of
+from pipeprog_sfm.model.self_calibration import RADII, TOLERATED_SHIFT, Priors, Refinement, numbers_of
 
 FIRST_CHECK = 6  # keyframes: fewer tie points seen from three sides do not tell k1 to a third of its prior
 CHECK_GROWTH = 2  # ratio of the keyframes at two checks while keyframes come: their cost stays a constant share
-# px, by which another calibration moves a point of the image: below, every match passes the geometric checks, and the
-# end will do.
-EARLY_SHIFT = 1.0
 FINAL_SHIFT = 0.2  # px: a careful calibration with a board is right to this at the image's edge
 MAX_BOARD_GROWTH = 1.1  # of a board's misfit, with a better camera: of 20 circles it is known to a tenth
 K2_SHARE = 2.0  # standard deviation of k2 over that of k1: it counts half as much where the image's corner has r = 0.7
@@ -98,7 +95,7 @@ class CameraInUse:
             return True  # that it differs has been decided, the last images only say it best
         if found.camera == found.told:  # the read-out alone, which is refined where it matters to the poses
             return bool(found.changes[3]) and (final or found.shift > FINAL_SHIFT)
-        return found.is_significant and found.shift > (FINAL_SHIFT if final else EARLY_SHIFT)
+        return found.is_significant and found.shift > (FINAL_SHIFT if final else TOLERATED_SHIFT)
 
     def accept(self, found: Refinement) -> None:
         """Goes on with a refined camera."""

@@ -35,7 +35,7 @@ from pipeprog_sfm.model.sparse_model import SparseModel
 
 MAX_POINTS = 4000  # points used, evenly thinned: three numbers need no more, and the cost does not grow with the map
 # Points used while keyframes come: what matters then moves a corner of the image by 1 px, as a k1 that is off by 0.002
-# does (720p), and 24 views of 1000 points tell k1 to 0.0003.
+# does (720p), and 24 views of 1000 points tell k1 to 0.0003. With a rolling shutter in the end as well.
 EARLY_POINTS = 1000
 MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera that its depth does not take up
 DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with more, the prior has decided
@@ -52,6 +52,9 @@ LEAST_READOUT = 0.001
 # px, root mean square of the moves of features by a change of the read-out in use, below which it does not matter: at
 # 20 ms and 1.4 m/s, 0.05 px (1 %) put a path off by 0.13 mm, and a fifth of it is less than the features' noise does.
 LEAST_MOVE = 0.01
+# px, by which another camera moves a point of the image: below, every match passes the geometric checks, so that a
+# calibration can wait for the end, and a map stays with another read-out.
+TOLERATED_SHIFT = 1.0
 RADII = 8  # equal areas of the image, as rings, in which residuals are averaged
 MIN_IN_RING = 100  # residuals of a ring: their mean is known to a twentieth of a pixel
 

@@ -18,7 +18,14 @@ from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
 from pipeprog_sfm.features.sift import Features, extract
 from pipeprog_sfm.model.row_motion import predicted_motion, row_motions, told_by_rows, unroll, unrolled_by
-from pipeprog_sfm.model.self_calibration import EARLY_POINTS, MAX_POINTS, Priors, Refinement, refine
+from pipeprog_sfm.model.self_calibration import (
+    EARLY_POINTS,
+    MAX_POINTS,
+    TOLERATED_SHIFT,
+    Priors,
+    Refinement,
+    refine,
+)
 from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.localizer import Localizer
 from pipeprog_sfm.sparse.loop_closure import close_loop
@@ -32,8 +39,6 @@ RETRIES = 3  # waiting keyframes tried again with each new one: a constant cost,
 # Waiting keyframes of each camera that a new one may start a model with: a baseline grows within a second or two.
 START_CANDIDATES = 8
 REMEMBERED = 100  # retired keyframes whose features are kept in case they are added again: 60 MB
-# px, moves of features by another read-out up to which the map is kept: every match passes the geometric checks.
-KEPT_SHIFT = 1.0
 
 
 @dataclass(frozen=True)
@@ -149,13 +154,13 @@ class Mapper:
     def take_camera(self, refinement: Refinement, final: bool) -> None:
         """Goes on with a refined camera; final: `finish` comes next.
 
-        Another read-out that moves no feature by more than KEPT_SHIFT keeps the map. Else it grows again, from the
+        Another read-out that moves no feature by more than TOLERATED_SHIFT keeps the map. Else it grows again, from the
         features of its keyframes: matches that another camera had rejected would stay out. Features and most matches
         are there: it takes seconds.
         """
         told, camera = refinement.told, refinement.camera
         is_rolling = self.map.readout > 0.0 and refinement.readout > 0.0
-        if is_rolling and camera == told and refinement.shift < KEPT_SHIFT:
+        if is_rolling and camera == told and refinement.shift < TOLERATED_SHIFT:
             self.map.readout = refinement.readout
             for model in [] if final else list(self.map.models):
                 self.map.adjust_globally(model, by_spline=MAX_TURNS)

@@ -20,9 +20,9 @@ from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
 from pipeprog_sfm.model.row_fit import fit_rows
 from pipeprog_sfm.model.row_motion import row_motions, told_by_rows
-from pipeprog_sfm.model.self_calibration import Priors
+from pipeprog_sfm.model.self_calibration import TOLERATED_SHIFT, Priors
 from pipeprog_sfm.model.sparse_model import SparseModel
-from pipeprog_sfm.sparse.mapper import KEPT_SHIFT, Mapper
+from pipeprog_sfm.sparse.mapper import Mapper
 from pipeprog_sfm.sparse.registration import doubtful_views
 
 READOUT = 0.03  # s
@@ -116,7 +116,7 @@ def test_a_read_out_that_was_off_leaves_no_trace(
     mapper, _ = walk(factor * READOUT, count=40)
     found = mapper.self_calibration(UNKNOWN, final=True)
     assert found is not None
-    assert (found.shift > KEPT_SHIFT) == grows_again
+    assert (found.shift > TOLERATED_SHIFT) == grows_again
     mapper.take_camera(replace(found, readout=READOUT), final)
     if final:
         mapper.finish()
@@ -262,7 +262,7 @@ def test_a_read_out_that_was_none_leaves_no_motion(told: tuple[Mapper, dict[int,
     mapper = copy.deepcopy(told[0])
     found = mapper.self_calibration(UNKNOWN, final=True)
     assert found is not None
-    mapper.take_camera(replace(found, camera=CAMERA, readout=0.0, shift=0.5 * KEPT_SHIFT), final=True)
+    mapper.take_camera(replace(found, camera=CAMERA, readout=0.0, shift=0.5 * TOLERATED_SHIFT), final=True)
     assert mapper.map.motions(mapper.map.published) == {}
 
 
