@@ -147,6 +147,10 @@ class DenseMapper:
         self._settle(keyframes, complete)
         self._submit(all_of_them=complete)
 
+    def start_waiting(self) -> None:
+        """Has the thread make all depth maps that wait for their turn, however many these are."""
+        self._submit(all_of_them=True)
+
     def retire(self, stamps: Collection[int]) -> None:
         """Gives up depth maps; what they showed is left to others again."""
         for stamp in stamps:
