@@ -23,7 +23,7 @@ from pipeprog_sfm.alignment.alignment import Alignment, align
 from pipeprog_sfm.alignment.placing import NotAlignedError
 from pipeprog_sfm.alignment.survey_map import MappedBoard, SurveyMap, sparse_part, thinned
 from pipeprog_sfm.boards.board_file import BoardFile
-from pipeprog_sfm.camera_in_use import FINAL_SHIFT, CameraInUse, board_agrees, radial_warning
+from pipeprog_sfm.camera_in_use import CameraInUse, board_agrees, radial_warning
 from pipeprog_sfm.config import NOT_TOLD, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, Registered, centre
@@ -33,14 +33,15 @@ from pipeprog_sfm.metric.scale import DISAGREEMENT, NoScaleError, ScaleEstimate
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.metric.unrolled_ellipses import RollingViews
+from pipeprog_sfm.model.self_calibration import TOLERATED_SHIFT
 from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
 from pipeprog_sfm.sparse.overlap import OverlapReport
 from pipeprog_sfm.types import EncodedImage
 
-# Of read-out and poses in turns: velocities follow the poses, and a map made anew leaves a sixth to a half of the error
-# (20 ms told as 24 ms: 20.7, 20.2, 20.05, 19.97).
+# Of read-out and poses in turns: poses and velocities follow what the read-out is off by, so that a turn leaves up to a
+# half of it (20 ms told as 24 ms: 20.2, 19.95).
 READOUT_ROUNDS = 6
 EARLY_ROUNDS = 2  # of these while keyframes come: the next ones tell more than further rounds
 
@@ -326,7 +327,7 @@ class Reconstruction:
         measured = self._metric_tracker
         if found.camera != found.told:
             measured = measured.remeasured(((stamp, image.gray()) for stamp, image in images.items()), found.camera)
-        if found.camera != found.told or found.shift > FINAL_SHIFT:  # boards do not tell less
+        if found.camera != found.told or found.shift > TOLERATED_SHIFT:  # of a read-out boards do not tell less
             model = self._map.published
             rolling, other = (
                 _rolling(model, self._map.spline_motions(model, each)) for each in (self._map.readout, found.readout)

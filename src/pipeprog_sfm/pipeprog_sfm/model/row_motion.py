@@ -54,11 +54,19 @@ LONG_TRACK = 6
 
 
 @dataclass(frozen=True)
-class _ByRows:
-    """Motions by stamp: of views where the spline is no alternative, and of all that rows correct together."""
+class ToldMotions:
+    """Motions by stamp: of all views by the spline, of those where their rows decide, and of all that rows correct.
 
+    Rows tell the product of velocity and read-out: the velocities on which they decide take up an error of the latter.
+    """
+
+    by_spline: dict[int, RowMotion]
     decided: dict[int, RowMotion]
     corrected: dict[int, RowMotion]
+
+    def of_all(self, rows_correct: bool) -> dict[int, RowMotion]:
+        """Of all views; without `rows_correct` those that do not contradict the spline have its velocities."""
+        return self.by_spline | (self.corrected if rows_correct else {}) | self.decided
 
 
 def row_motions(
@@ -67,14 +75,23 @@ def row_motions(
     readout: float,
     near: IntArray | None = None,
     count: int | None = None,
-    rows_correct: bool = True,
 ) -> dict[int, RowMotion]:
     """How the model moves as seen from its views, by stamp; left out where it is unknown.
 
     Lengths are in the unit of the model. Each camera of a rig has a trajectory of its own. With `near`, the trajectory
-    is that of these views alone, and the motions are those of the first `count` of them. Without `rows_correct`
-    views that do not contradict the spline have its velocities.
+    is that of these views alone, and the motions are those of the first `count` of them.
     """
+    return told_motions(model, keyframes, readout, near, count).of_all(rows_correct=True)
+
+
+def told_motions(
+    model: SparseModel,
+    keyframes: Mapping[int, Keyframe],
+    readout: float,
+    near: IntArray | None = None,
+    count: int | None = None,
+) -> ToldMotions:
+    """As `row_motions`, by what tells them."""
     views = np.arange(len(model)) if near is None else near
     wanted = set(views[:count].tolist())
     by_camera: defaultdict[object, list[int]] = defaultdict(list)
@@ -82,7 +99,7 @@ def row_motions(
         keyframe = keyframes[model.stamps[view]]
         by_camera[keyframe.frame, keyframe.camera].append(view)
     centres = model.centres()
-    found: dict[int, RowMotion] = {}
+    found = ToldMotions({}, {}, {})
     for members in by_camera.values():
         order = np.array(sorted(members, key=model.stamps.__getitem__))
         stamps = np.array([model.stamps[view] for view in order], np.int64)
@@ -96,11 +113,12 @@ def row_motions(
             }
             if motions and readout > 0.0:
                 is_long = near is None and len(part) >= LONG_TRAJECTORY
-                fits = _by_own_rows(model, part, keyframes, motions, wanted, is_long)
-                motions |= fits.decided | (fits.corrected if rows_correct else {})
-            found |= motions
-    asked = {model.stamps[view] for view in wanted}
-    return {stamp: motion for stamp, motion in found.items() if stamp in asked}
+                decided, corrected = _by_own_rows(model, part, keyframes, motions, wanted, is_long)
+                found.decided.update(decided)
+                found.corrected.update(corrected)
+            asked = {model.stamps[view] for view in part if view in wanted}
+            found.by_spline.update((stamp, motion) for stamp, motion in motions.items() if stamp in asked)
+    return found
 
 
 def unroll(model: SparseModel, keyframes: MutableMapping[int, Keyframe], motions: Mapping[int, RowMotion]) -> float:
@@ -210,8 +228,8 @@ def _by_own_rows(
     motions: Mapping[int, RowMotion],
     wanted: Container[int],
     is_long: bool,
-) -> _ByRows:
-    """The spline's `motions` of views, in order of time, as their own rows correct them; those `wanted` alone.
+) -> tuple[dict[int, RowMotion], dict[int, RowMotion]]:
+    """The spline's `motions` of the `wanted` among views in order of time: `decided` and `corrected`, by stamp.
 
     The rows alone decide for the outermost views. In a long trajectory they correct all others, and the spline is no
     alternative for END_KNOTS at each end and for those that contradict it.
@@ -233,7 +251,7 @@ def _by_own_rows(
     bends = _bends(motions.values())  # an end bends as the walk does
     decided = {stamps[number]: fitted(number, sigmas[number], bends).motion for number in numbers[knots == 0]}
     if not is_long:
-        return _ByRows(decided, {})
+        return decided, {}
     inner, knots = numbers[knots > 0], knots[knots > 0]
     fits = [fitted(number, sigmas[number]) for number in inner]
     times = np.array([stamps[number] - stamps[0] for number in inner]) * 1e-9
@@ -243,7 +261,7 @@ def _by_own_rows(
     for number, knot, wrong, motion in zip(inner, knots, is_wrong, corrected, strict=True):
         if wrong or knot < END_KNOTS:
             decided[stamps[number]] = motion
-    return _ByRows(decided, {stamps[number]: motion for number, motion in zip(inner, corrected, strict=True)})
+    return decided, {stamps[number]: motion for number, motion in zip(inner, corrected, strict=True)}
 
 
 def _bends(motions: Iterable[RowMotion]) -> FloatArray:

@@ -40,8 +40,8 @@ EARLY_POINTS = 1000
 MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera that its depth does not take up
 DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with more, the prior has decided
 SIGNIFICANT = 5.0  # standard deviations of a change: features share errors that the covariance knows in part only
-# Standard deviations by which one step contradicts a read-out that was told: velocities have followed it, so that a
-# step finds a third to a half of what is off (a read-out that was right was contradicted by up to 2.5).
+# Standard deviations by which one step contradicts a read-out that was told: poses and velocities have followed it, so
+# that a step finds a half of what is off (a read-out that was right was contradicted by up to 1.4).
 CONTRADICTED = 3.0
 MAX_ITERATIONS = 15  # of Levenberg-Marquardt; 3 to 6 for a calibration, up to 12 for a guess, are needed
 CONVERGED = 0.1  # of its standard deviation, change of each number at which the iterations end
@@ -241,7 +241,7 @@ def refine(
         keyframes: at least those of the model's views, by stamp; all have the camera in use.
         told: what was told of the camera.
         motions: of the views while their rows are read out with the read-out in use, by stamp; a view without one tells
-            nothing of the read-out.
+            nothing of the read-out, nor may one whose velocity is told by its rows: they tell velocity times read-out.
         points: used at the most.
     """
     camera = keyframes[model.stamps[0]].camera

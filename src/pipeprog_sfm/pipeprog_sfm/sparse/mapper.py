@@ -17,7 +17,7 @@ from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
 from pipeprog_sfm.features.sift import Features, extract
-from pipeprog_sfm.model.row_motion import predicted_motion, row_motions, told_by_rows, unroll, unrolled_by
+from pipeprog_sfm.model.row_motion import predicted_motion, told_by_rows, told_motions, unroll, unrolled_by
 from pipeprog_sfm.model.self_calibration import (
     EARLY_POINTS,
     MAX_POINTS,
@@ -145,10 +145,11 @@ class Mapper:
         if len({keyframes[stamp].camera for stamp in model.stamps}) != 1:
             return None
         if told.sigmas[3] > 0:
-            motions = row_motions(model, keyframes, self.map.readout, rows_correct=False)
-        if self.map.readout and motions:
-            model, keyframes = copy.deepcopy(model), dict(keyframes)
-            unroll(model, keyframes, motions)
+            moving = told_motions(model, keyframes, self.map.readout)
+            motions = {stamp: motion for stamp, motion in moving.by_spline.items() if stamp not in moving.decided}
+            if self.map.readout and moving.by_spline:
+                model, keyframes = copy.deepcopy(model), dict(keyframes)
+                unroll(model, keyframes, moving.of_all(rows_correct=False))
         return refine(model, keyframes, told, motions, MAX_POINTS if final and not self.map.readout else EARLY_POINTS)
 
     def take_camera(self, refinement: Refinement, final: bool) -> None:
