@@ -33,7 +33,6 @@ from pipeprog_sfm.metric.scale import DISAGREEMENT, NoScaleError, ScaleEstimate
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.metric.unrolled_ellipses import RollingViews
-from pipeprog_sfm.model.self_calibration import TOLERATED_SHIFT
 from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.colmap import ModelView, write_model
 from pipeprog_sfm.sparse.mapper import GROWTH, KeyframeReport, Mapper
@@ -327,7 +326,7 @@ class Reconstruction:
         measured = self._metric_tracker
         if found.camera != found.told:
             measured = measured.remeasured(((stamp, image.gray()) for stamp, image in images.items()), found.camera)
-        if found.camera != found.told or found.shift > TOLERATED_SHIFT:  # of a read-out boards do not tell less
+        if not self._mapper.keeps_map(found):  # boards do not tell so little
             model = self._map.published
             rolling, other = (
                 _rolling(model, self._map.spline_motions(model, each)) for each in (self._map.readout, found.readout)

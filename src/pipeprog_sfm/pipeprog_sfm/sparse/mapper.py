@@ -152,16 +152,19 @@ class Mapper:
                 unroll(model, keyframes, moving.of_all(rows_correct=False))
         return refine(model, keyframes, told, motions, MAX_POINTS if final and not self.map.readout else EARLY_POINTS)
 
+    def keeps_map(self, refinement: Refinement) -> bool:
+        """Whether the map stays with a refined camera: another read-out moves no feature by TOLERATED_SHIFT."""
+        is_rolling = self.map.readout > 0.0 and refinement.readout > 0.0
+        return is_rolling and refinement.camera == refinement.told and refinement.shift < TOLERATED_SHIFT
+
     def take_camera(self, refinement: Refinement, final: bool) -> None:
         """Goes on with a refined camera; final: `finish` comes next.
 
-        Another read-out that moves no feature by more than TOLERATED_SHIFT keeps the map. Else it grows again, from the
-        features of its keyframes: matches that another camera had rejected would stay out. Features and most matches
-        are there: it takes seconds.
+        Where the map does not stay (`keeps_map`), it grows again, from the features of its keyframes: matches that
+        another camera had rejected would stay out. Features and most matches are there: it takes seconds.
         """
         told, camera = refinement.told, refinement.camera
-        is_rolling = self.map.readout > 0.0 and refinement.readout > 0.0
-        if is_rolling and camera == told and refinement.shift < TOLERATED_SHIFT:
+        if self.keeps_map(refinement):
             self.map.readout = refinement.readout
             for model in [] if final else list(self.map.models):
                 self.map.adjust_globally(model, by_spline=MAX_TURNS)
