@@ -279,7 +279,7 @@ class SfmNode(Node):
         limit_cores(config.cores, self.get_logger().warning)
         board = declare_fixed(self, "board", "", "file of the boards on site")
         intermediate = declare_fixed(
-            self, "intermediate", True, "publish maps while keyframes come, not the last alone"
+            self, "intermediate", True, "publish maps and poses while keyframes come, not the last alone"
         )
         reference = declare_fixed(self, "reference", "", "map.npz of the survey in whose frame the map is to lie")
         earlier = read_map(Path(reference)) if reference else None

@@ -81,7 +81,7 @@ class Ready:
 
 @dataclass(frozen=True)
 class KeyframeDone:
-    """Event: a keyframe was processed; the trajectory is None while there is no scale."""
+    """Event: a keyframe was processed; the trajectory is None while there is no scale or only a map is wanted."""
 
     stamp: int
     frame: str
@@ -161,10 +161,11 @@ def work(
     A map is requested after `map_interval` keyframes, and one of all depth maps that can be made by then when all
     commands are worked off and no keyframe has come for IDLE_SECONDS; with None, no map but the last. Once none has
     come for HOLD_SECONDS the others are not requested, and one that is finished then is sent when the next keyframe
-    comes, or not at all where the one of all depth maps follows.
+    comes, or not at all where the one of all depth maps follows. With None no poses are told before the map either.
     """
+    posed = map_interval is not None
     for earlier in answered:
-        _answer(reconstruction, earlier)
+        _answer(reconstruction, earlier, posed)
         reconstruction.update_dense()
     channel.send(Ready())
     since_map, settled, heard, done = 0, True, clock(), clock()
@@ -179,7 +180,7 @@ def work(
                 channel.send(_finish(channel, reconstruction, command))
                 since_map, settled, held = 0, True, None  # one after the last map would have a stamp without pipes
                 continue
-            channel.send(_answer(reconstruction, command))
+            channel.send(_answer(reconstruction, command, posed))
             if isinstance(command, AddKeyframe):
                 reconstruction.update_dense()  # once the pose is out
                 since_map, settled = since_map + 1, False
@@ -227,22 +228,24 @@ def _take(channel: Channel, waiting: deque[Command], patience: float | None) -> 
     return came
 
 
-def _answer(reconstruction: Reconstruction, command: AddKeyframe | Retire) -> KeyframeDone | Retired:
+def _answer(reconstruction: Reconstruction, command: AddKeyframe | Retire, posed: bool) -> KeyframeDone | Retired:
     if isinstance(command, AddKeyframe):
-        return _add(reconstruction, command)
+        return _add(reconstruction, command, posed)
     reconstruction.retire(command.stamps)
     return Retired(reconstruction.status(), reconstruction.overlap_reports())
 
 
-def _add(reconstruction: Reconstruction, keyframe: AddKeyframe) -> KeyframeDone:
+def _add(reconstruction: Reconstruction, keyframe: AddKeyframe, posed: bool) -> KeyframeDone:
+    """Takes a keyframe; `posed`: poses are told as they stand, for which the scale is estimated."""
     reconstruction.move(keyframe.motion)
     try:
         reconstruction.add(keyframe.stamp, keyframe.encoded, keyframe.camera, keyframe.frame)
     except InputError as error:
         reconstruction.skip(keyframe.stamp, str(error))
     trajectory = None
-    with contextlib.suppress(NotMetricError):  # the status says why
-        trajectory = reconstruction.trajectory()
+    if posed:
+        with contextlib.suppress(NotMetricError):  # the status says why
+            trajectory = reconstruction.trajectory()
     overlaps = reconstruction.overlap_reports()
     return KeyframeDone(keyframe.stamp, keyframe.frame, reconstruction.status(), overlaps, trajectory)
 

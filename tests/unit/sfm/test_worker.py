@@ -200,11 +200,12 @@ def test_a_camera_at_rest_without_a_scale_is_not_asked_again() -> None:
     assert [type(event) for event in sent] == [worker.Ready, worker.KeyframeDone]
 
 
-def test_without_an_interval_the_last_map_is_the_only_one() -> None:
+def test_without_an_interval_the_last_map_is_the_only_one_and_no_poses_come_before() -> None:
     sent = events(*[KEYFRAME] * 4, 10 * IDLE_SECONDS, worker.Finish(), map_interval=None)
     kinds = [worker.Ready, *[worker.KeyframeDone] * 4, worker.MapReady, worker.Finished]
     assert [type(event) for event in sent] == kinds
     assert sent[-2].map == "last map"
+    assert [event.trajectory for event in sent if isinstance(event, worker.KeyframeDone)] == [None] * 4
 
 
 def test_what_a_predecessor_answered_is_not_answered_again() -> None:
