@@ -50,8 +50,8 @@ HELD = 1e-9  # standard deviation of a number that stays as it is
 # s, below which all rows count as exposed at once: 0.3 px at walking pace, and the fastest rolling shutters take 2 ms.
 LEAST_READOUT = 0.001
 # px, root mean square of the moves of features by a change of the read-out in use, below which it does not matter: at
-# 20 ms and 1.4 m/s, 0.05 px (1 %) put a path off by 0.13 mm, and this by 0.05 mm, a third of what it is off by anyway.
-LEAST_MOVE = 0.02
+# 20 ms and 1.4 m/s, 0.05 px (1 %) put a path off by 0.13 mm, and a fifth of it is less than the features' noise does.
+LEAST_MOVE = 0.01
 # px, by which another camera moves a point of the image: below, every match passes the geometric checks, so that a
 # calibration can wait for the end, and a map stays with another read-out.
 TOLERATED_SHIFT = 1.0
