@@ -153,7 +153,7 @@ class Mapper:
         return refine(model, keyframes, told, motions, MAX_POINTS if final and not self.map.readout else EARLY_POINTS)
 
     def keeps_map(self, refinement: Refinement) -> bool:
-        """Whether the map stays with a refined camera: another read-out moves no feature by TOLERATED_SHIFT."""
+        """Whether the map stays with a refined camera: another read-out moves each feature by less than 1 px."""
         is_rolling = self.map.readout > 0.0 and refinement.readout > 0.0
         return is_rolling and refinement.camera == refinement.told and refinement.shift < TOLERATED_SHIFT
 
