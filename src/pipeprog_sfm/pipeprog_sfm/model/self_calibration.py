@@ -41,7 +41,7 @@ MIN_TRACK = 3  # views of a point: two views of it say nothing on the camera tha
 DETERMINED = 1 / 3  # of the prior's standard deviation that may be left: with more, the prior has decided
 SIGNIFICANT = 5.0  # standard deviations of a change: features share errors that the covariance knows in part only
 # Standard deviations by which one step contradicts a read-out that was told: poses and velocities have followed it, so
-# that a step finds a half of what is off (a read-out that was right was contradicted by up to 1.4).
+# that a step finds a half of what is off (three labs: a read-out that was right was contradicted by up to 1.3).
 CONTRADICTED = 3.0
 MAX_ITERATIONS = 15  # of Levenberg-Marquardt; 3 to 6 for a calibration, up to 12 for a guess, are needed
 CONVERGED = 0.1  # of its standard deviation, change of each number at which the iterations end
