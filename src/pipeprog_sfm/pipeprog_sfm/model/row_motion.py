@@ -64,7 +64,7 @@ class ToldMotions:
     decided: dict[int, RowMotion]
     corrected: dict[int, RowMotion]
 
-    def of_all(self, rows_correct: bool) -> dict[int, RowMotion]:
+    def of_all(self, rows_correct: bool = True) -> dict[int, RowMotion]:
         """Of all views; without `rows_correct` those that do not contradict the spline have its velocities."""
         return self.by_spline | (self.corrected if rows_correct else {}) | self.decided
 
@@ -75,23 +75,12 @@ def row_motions(
     readout: float,
     near: IntArray | None = None,
     count: int | None = None,
-) -> dict[int, RowMotion]:
-    """How the model moves as seen from its views, by stamp; left out where it is unknown.
+) -> ToldMotions:
+    """How the model moves as seen from its views, by what tells it; views of which it is unknown are left out.
 
     Lengths are in the unit of the model. Each camera of a rig has a trajectory of its own. With `near`, the trajectory
     is that of these views alone, and the motions are those of the first `count` of them.
     """
-    return told_motions(model, keyframes, readout, near, count).of_all(rows_correct=True)
-
-
-def told_motions(
-    model: SparseModel,
-    keyframes: Mapping[int, Keyframe],
-    readout: float,
-    near: IntArray | None = None,
-    count: int | None = None,
-) -> ToldMotions:
-    """As `row_motions`, by what tells them."""
     views = np.arange(len(model)) if near is None else near
     wanted = set(views[:count].tolist())
     by_camera: defaultdict[object, list[int]] = defaultdict(list)
@@ -179,7 +168,7 @@ def predicted_motion(
     another = (nearest.frame, nearest.camera) != (keyframe.frame, keyframe.camera)
     if another or abs(nearest.stamp - keyframe.stamp) > MAX_GAP * 1e9:
         return None
-    return row_motions(model, keyframes, readout, near, 1).get(nearest.stamp)
+    return row_motions(model, keyframes, readout, near, 1).of_all().get(nearest.stamp)
 
 
 def unrolled_by(model: SparseModel, keyframe: Keyframe, motion: RowMotion) -> Keyframe:

@@ -17,7 +17,7 @@ from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.retrieval import COARSE, Retrieval
 from pipeprog_sfm.features.sift import Features, extract
-from pipeprog_sfm.model.row_motion import predicted_motion, told_by_rows, told_motions, unroll, unrolled_by
+from pipeprog_sfm.model.row_motion import predicted_motion, row_motions, told_by_rows, unroll, unrolled_by
 from pipeprog_sfm.model.self_calibration import (
     EARLY_POINTS,
     MAX_POINTS,
@@ -145,7 +145,7 @@ class Mapper:
         if len({keyframes[stamp].camera for stamp in model.stamps}) != 1:
             return None
         if told.sigmas[3] > 0:
-            moving = told_motions(model, keyframes, self.map.readout)
+            moving = row_motions(model, keyframes, self.map.readout)
             motions = {stamp: motion for stamp, motion in moving.by_spline.items() if stamp not in moving.decided}
             if self.map.readout and moving.by_spline:
                 model, keyframes = copy.deepcopy(model), dict(keyframes)

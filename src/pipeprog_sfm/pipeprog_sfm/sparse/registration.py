@@ -83,7 +83,7 @@ def add_view(
     model.point_of[model.offsets[view] + used[first, 0]] = used[first, 1]
     if readout:
         near = near_in_time(model, keyframe.stamp)
-        unroll(model, keyframes, row_motions(model, keyframes, readout, near, MOVED))
+        unroll(model, keyframes, row_motions(model, keyframes, readout, near, MOVED).of_all())
     link(model, view, keyframes)
     _adjust_around(model, view)
     return view

@@ -12,7 +12,7 @@ from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.matching import MatchArray
 from pipeprog_sfm.model.model_adjustment import adjust_model, pose_covariance
-from pipeprog_sfm.model.row_motion import told_motions, unroll
+from pipeprog_sfm.model.row_motion import row_motions, unroll
 from pipeprog_sfm.model.self_calibration import RADII, radial_residuals
 from pipeprog_sfm.model.sparse_model import SparseModel
 from pipeprog_sfm.sparse.overlap import OverlapReport, OverlapTracker
@@ -127,7 +127,7 @@ class SparseMap:
 
     def spline_motions(self, model: SparseModel, readout: float) -> dict[int, RowMotion]:
         """As `motions`, by the poses and a read-out [s] alone: velocities that rows correct take up its error, too."""
-        return told_motions(model, self.keyframes, readout).of_all(rows_correct=False) if readout else {}
+        return row_motions(model, self.keyframes, readout).of_all(rows_correct=False) if readout else {}
 
     def motions(self, model: SparseModel) -> dict[int, RowMotion]:
         """How a model moves as seen from its views while their rows are read out, by stamp; empty without readout.
@@ -140,7 +140,7 @@ class SparseMap:
     def _adjust_rolling(self, model: SparseModel, turns: int, rows_correct: bool) -> None:
         """Finds shifts of features and poses in turns, until the shifts stay; rows_correct: see `ToldMotions`."""
         for _ in range(turns):
-            motions = told_motions(model, self.keyframes, self.readout).of_all(rows_correct)
+            motions = row_motions(model, self.keyframes, self.readout).of_all(rows_correct)
             change = unroll(model, self.keyframes, motions)
             adjust_model(model)
             if change < SETTLED:
