@@ -172,9 +172,9 @@ class SparseModel:
         """(V,) hash of each view's points: another number when they have changed."""
         return digests(self.point_of, np.array(self.offsets))
 
-    def covisible(self, view: int) -> IntArray:
-        """(V,) number of points that each view shares with this one; 0 for itself."""
-        return covisible(view, self.point_of, np.array(self.offsets), len(self.points))
+    def covisible(self, views: IntArray) -> IntArray:
+        """(N, V) number of points that each view shares with these (N,); 0 for itself."""
+        return np.asarray(covisible(views, self.point_of, np.array(self.offsets), len(self.points)))
 
     def forget_unseen(self) -> None:
         """Removes the points that no view sees, and numbers the others anew."""

@@ -34,18 +34,31 @@ def digests(point_of, offsets):  # type: ignore[no-untyped-def]  # compiled
 
 
 @njit(cache=True, nogil=True)
-def covisible(view, point_of, offsets, points):  # type: ignore[no-untyped-def]  # compiled
-    """(V,) number of features of each view whose points, of which there are `points`, this one sees, too."""
-    seen = np.zeros(points, np.bool_)
-    for feature in range(offsets[view], offsets[view + 1]):
-        if point_of[feature] != NONE:
-            seen[point_of[feature]] = True
-    shared = np.zeros(len(offsets) - 1, np.int64)
-    for other in range(len(shared)):
-        if other != view:
-            for feature in range(offsets[other], offsets[other + 1]):
-                if point_of[feature] != NONE and seen[point_of[feature]]:
-                    shared[other] += 1
+def covisible(views, point_of, offsets, points):  # type: ignore[no-untyped-def]  # compiled
+    """(N, V) number of features of each view whose points, of which there are `points`, the N views see, too."""
+    start = np.zeros(points + 1, np.int64)
+    for view in views:
+        for feature in range(offsets[view], offsets[view + 1]):
+            if point_of[feature] != NONE:
+                start[point_of[feature] + 1] += 1
+    start = np.cumsum(start)
+    end = start[:-1].copy()
+    seen_by = np.empty(start[-1], np.int64)  # from start to end of a point: which of the N see it
+    for number, view in enumerate(views):
+        for feature in range(offsets[view], offsets[view + 1]):
+            point = point_of[feature]
+            if point != NONE and (end[point] == start[point] or seen_by[end[point] - 1] != number):
+                seen_by[end[point]] = number
+                end[point] += 1
+    shared = np.zeros((len(views), len(offsets) - 1), np.int64)
+    for other in range(shared.shape[1]):
+        for feature in range(offsets[other], offsets[other + 1]):
+            point = point_of[feature]
+            if point != NONE:
+                for k in range(start[point], end[point]):
+                    shared[seen_by[k], other] += 1
+    for number, view in enumerate(views):
+        shared[number, view] = 0
     return shared
 
 

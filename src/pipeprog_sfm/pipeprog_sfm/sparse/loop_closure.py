@@ -59,7 +59,7 @@ def loop_candidates(model: SparseModel, view: int, window: int = LOCAL_WINDOW) -
     """
     rank = np.argsort(np.argsort(model.stamps))
     distant = np.abs(rank - rank[view]) > 2 * window
-    covisible = (model.covisible(view)[distant] >= MIN_INLIERS).any()
+    covisible = (model.covisible(np.array([view]))[0, distant] >= MIN_INLIERS).any()
     return np.flatnonzero(distant & (not covisible))
 
 

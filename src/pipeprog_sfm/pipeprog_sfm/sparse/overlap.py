@@ -58,17 +58,22 @@ class OverlapTracker:
             mark = (marks.get(before), marks[stamp], marks.get(after))
             if self._reported.get(stamp) != mark:
                 self._reported[stamp] = mark
-                view = view_of.get(stamp)
-                if view is None:
-                    changed.append(_report(keyframes[stamp], None, 0, 0))
-                    continue
-                shared = model.covisible(view)
-                previous, following = (int(shared[view_of[one]]) if one in view_of else 0 for one in (before, after))
-                report = _report(keyframes[stamp], model.point_of[model.features(view)], previous, following)
-                if places:
-                    report = replace(report, place_overlap=place_overlap(model, view, shared, keyframes))
-                changed.append(report)
-        return changed
+                changed.append((before, stamp, after))
+        views = np.array([view_of[stamp] for _, stamp, _ in changed if stamp in view_of], np.int64)
+        shares = dict(zip(views.tolist(), model.covisible(views), strict=True))
+        reports = []
+        for before, stamp, after in changed:
+            view = view_of.get(stamp)
+            if view is None:
+                reports.append(_report(keyframes[stamp], None, 0, 0))
+                continue
+            shared = shares[view]
+            previous, following = (int(shared[view_of[one]]) if one in view_of else 0 for one in (before, after))
+            report = _report(keyframes[stamp], model.point_of[model.features(view)], previous, following)
+            if places:
+                report = replace(report, place_overlap=place_overlap(model, view, shared, keyframes))
+            reports.append(report)
+        return reports
 
 
 def place_overlap(model: SparseModel, view: int, shared: IntArray, keyframes: Mapping[int, Keyframe]) -> float:

@@ -167,7 +167,7 @@ def _absolute_pose(model: SparseModel, keyframe: Keyframe, pairs: IntArray, seed
 
 def _adjust_around(model: SparseModel, view: int) -> None:
     """Adjusts a view together with the views that share most points with it."""
-    shared = model.covisible(view)
+    shared = model.covisible(np.array([view]))[0]
     window = np.argsort(-shared, kind="stable")[: LOCAL_WINDOW - 1]
     window = np.append(window[shared[window] > 0], view)
     if len(model) <= LOCAL_WINDOW:

@@ -93,7 +93,7 @@ def visits(*places: float) -> tuple[SparseModel, dict[int, Keyframe]]:
 
 
 def seen_before(model: SparseModel, view: int, keyframes: dict[int, Keyframe]) -> float:
-    return place_overlap(model, view, model.covisible(view), keyframes)
+    return place_overlap(model, view, model.covisible(np.array([view]))[0], keyframes)
 
 
 def test_a_place_was_seen_by_keyframes_of_an_earlier_visit_and_not_by_later_ones() -> None:
@@ -107,11 +107,13 @@ def test_a_place_was_seen_by_keyframes_of_an_earlier_visit_and_not_by_later_ones
 def test_views_share_the_points_that_both_see() -> None:
     model, _ = visits(0, 1, 3, 1)
     model.point_of[model.features(3)] = -1
+    shared = model.covisible(np.arange(4))
     for number in range(4):
         own = set(model.seen(number).tolist())
         expected = [0 if other == number else len(own & set(model.seen(other).tolist())) for other in range(4)]
-        assert model.covisible(number).tolist() == expected
-    assert 0 < model.covisible(0)[2] < model.covisible(0)[1]
+        assert shared[number].tolist() == expected
+    assert 0 < shared[0, 2] < shared[0, 1]
+    np.testing.assert_array_equal(model.covisible(np.array([2, 0])), shared[[2, 0]])
 
 
 def test_neighbours_in_time_and_views_that_nothing_ties_are_no_earlier_visit() -> None:
