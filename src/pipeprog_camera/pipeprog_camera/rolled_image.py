@@ -134,24 +134,31 @@ def row_of(u: float, v: float, numbers: FloatArray, rows: FloatArray) -> float:
 @njit(cache=True, nogil=True)
 def shown_at(u: float, v: float, depth: float, numbers: FloatArray, rows: FloatArray) -> tuple[float, float]:
     """Where the image shows what lies at pixel (u, v) at the stamp; `numbers` and `rows` of `RolledImage`."""
-    fx, fy, cx, cy, per_row, first = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
-    x, y = (u - cx) / fx * depth, (v - cy) / fy * depth
     column, line = u, v
     for _ in range(_MOST_STEPS):
         left, above = column, line
-        time = first + per_row * row_of(column, line, numbers, rows)
-        a = time * (numbers[9] + time * numbers[15])
-        b = time * (numbers[10] + time * numbers[16])
-        c = time * (numbers[11] + time * numbers[17])
-        # Rodrigues' formula; the series of sine and cosine are exact to 1e-7 up to 0.2 rad within one read-out.
-        square = a * a + b * b + c * c
-        sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
-        p, q, r = b * depth - c * y, c * x - a * depth, a * y - b * x
-        far = depth + sine * r + cosine * (a * q - b * p) + time * (numbers[8] + time * numbers[14])
-        column = fx * (x + sine * p + cosine * (b * r - c * q) + time * (numbers[6] + time * numbers[12])) / far + cx
-        line = fy * (y + sine * q + cosine * (c * p - a * r) + time * (numbers[7] + time * numbers[13])) / far + cy
+        time = numbers[5] + numbers[4] * row_of(column, line, numbers, rows)
+        column, line = seen_after(u, v, depth, time, numbers)
         if abs(column - left) + abs(line - above) < _SETTLED:
             break
+    return column, line
+
+
+@njit(cache=True, nogil=True)
+def seen_after(u: float, v: float, depth: float, time: float, numbers: FloatArray) -> tuple[float, float]:
+    """Where the ideal pinhole camera sees, `time` [s] after the stamp, what lies at pixel (u, v) at the stamp."""
+    fx, fy, cx, cy = numbers[0], numbers[1], numbers[2], numbers[3]
+    x, y = (u - cx) / fx * depth, (v - cy) / fy * depth
+    a = time * (numbers[9] + time * numbers[15])
+    b = time * (numbers[10] + time * numbers[16])
+    c = time * (numbers[11] + time * numbers[17])
+    # Rodrigues' formula; the series of sine and cosine are exact to 1e-7 up to 0.2 rad within one read-out.
+    square = a * a + b * b + c * c
+    sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
+    p, q, r = b * depth - c * y, c * x - a * depth, a * y - b * x
+    far = depth + sine * r + cosine * (a * q - b * p) + time * (numbers[8] + time * numbers[14])
+    column = fx * (x + sine * p + cosine * (b * r - c * q) + time * (numbers[6] + time * numbers[12])) / far + cx
+    line = fy * (y + sine * q + cosine * (c * p - a * r) + time * (numbers[7] + time * numbers[13])) / far + cy
     return column, line
 
 

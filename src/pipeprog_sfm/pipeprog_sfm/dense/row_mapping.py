@@ -24,11 +24,13 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.rolled_image import RolledImage, row_of, shown_at
+from pipeprog_camera.rolled_image import RolledImage, row_of, seen_after
 from pipeprog_sfm.dense.depth_sampling import depth_at
 
 # Steps from a pixel at the stamp to where the image shows it: the depth is looked up anew in each.
-_STEPS = 3
+_STEPS = 6
+# A pixel that a step moves by less [px] is found: at most half of that is left of the error.
+_FOUND = 0.01
 # The last step moves a pixel by less than this [px], or the pixel is hidden at the stamp: a contour lies between.
 _SETTLED = 0.5
 # Relative difference of depth up to which neighbouring pixels lie on one surface.
@@ -180,25 +182,37 @@ def _at_the_stamp(depth, typical, numbers, rows):  # type: ignore[no-untyped-def
     result = np.full((height, width), np.nan, np.float32)
     places = np.zeros((height, width, 2), np.float32)
     for v in prange(height):
-        last = typical
+        there = typical
+        right, down = 0.0, 0.0  # from a pixel to where the image shows it: little changes from one to the next
         for u in range(width):
-            there = float(depth[v, u])
-            if not there > 0.0:
-                there = last
-            x, y = shown_at(float(u), float(v), there, numbers, rows)
+            if depth[v, u] > 0.0:
+                there = float(depth[v, u])
+            x, y = _step(u, v, there, u + right, v + down, numbers, rows)
+            is_shown = False
             for _ in range(_STEPS):
                 z = np.float64(depth_at(depth, x, y, _SAME_SURFACE))
-                if not z > 0.0:
-                    there = np.nan
+                is_shown = bool(z > 0.0)
+                if not is_shown:
                     break
                 there = _depth_at_stamp(x, y, z, numbers, rows)
                 before_x, before_y = x, y
-                x, y = shown_at(float(u), float(v), there, numbers, rows)
-            if there > 0.0 and max(abs(x - before_x), abs(y - before_y)) < _SETTLED:
+                x, y = _step(u, v, there, x, y, numbers, rows)
+                step = max(abs(x - before_x), abs(y - before_y))
+                is_shown = step < _SETTLED
+                if step < _FOUND:
+                    break
+            if is_shown:
                 result[v, u] = there
                 places[v, u] = x, y
-                last = there
+                right, down = x - u, y - v
     return result, places
+
+
+@njit(cache=True, nogil=True)
+def _step(u, v, depth, x, y, numbers, rows):  # type: ignore[no-untyped-def]
+    """Where the image shows pixel (u, v) of the stamp, at a depth, if that is in the row of (x, y)."""
+    time = numbers[5] + numbers[4] * row_of(x, y, numbers, rows)
+    return seen_after(float(u), float(v), depth, time, numbers)
 
 
 @njit(cache=True, nogil=True)
