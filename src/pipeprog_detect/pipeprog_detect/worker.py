@@ -19,6 +19,7 @@ from pipeprog_detect.detector import detect
 from pipeprog_detect.keyframe_cache import Keyframes
 from pipeprog_detect.look.colour_view import NO_CIRCLES, BoardCircles
 from pipeprog_detect.look.told_by_look import Seen, told_by_look
+from pipeprog_detect.overlapping_views import without_overlapping
 from pipeprog_detect.product.boq import BillOfQuantities
 from pipeprog_detect.product.classification import asks_look
 from pipeprog_detect.product.pipe_tracker import PipeTracker
@@ -138,6 +139,7 @@ def serve(
             memory.novelty = MapChange()
         normals = None if command.normals is None else command.normals.astype(float)
         cloud = Cloud(command.points.astype(float), normals)
+        views = without_overlapping(views, cloud.points)
         boards = board_faces(command.circles.centres, command.circles.radii)
         try:
             pipes = detect(cloud, boq, config, views, memory=memory, boards=boards)
