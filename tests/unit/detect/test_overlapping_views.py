@@ -5,17 +5,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
+from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.rolled_image import RolledImage
+from pipeprog_camera.rolled_image import RolledImage, RowVelocities
 from pipeprog_camera.rolling_shutter import RowMotion
+from pipeprog_detect import worker
+from pipeprog_detect.config import DetectConfig
 from pipeprog_detect.overlapping_views import OVERLAP, without_overlapping
-from pipeprog_detect.types import View
+from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
+from pipeprog_detect.types import Pipe, View
 
 CAMERA = Camera(640, 360, 460.0, 460.0, 319.5, 179.5)
 DEPTH = 2.0  # m to the wall
@@ -50,6 +56,28 @@ def test_every_other_view_of_a_slow_walk_is_left_out() -> None:
 def test_all_views_of_a_fast_walk_stay() -> None:
     """Neighbours are 0.1 of an image apart, those two further 0.2."""
     assert stamps(walk([0.1 * SEEN * number for number in range(11)])) == list(range(11))
+
+
+def test_the_worker_measures_in_these(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = walk([0.06 * SEEN * number for number in range(5)])
+    encoded = cv2.imencode(".png", views[0].image)[1].tobytes()
+    poses = np.stack([np.linalg.inv(view.camera_from_map) for view in views])
+    still = np.zeros((5, 3))
+    velocities = RowVelocities(0.02, still, still, still, still)
+    site = worker.Map(1, POINTS.astype(np.float32), None, np.arange(5), poses, final=True, velocities=velocities)
+    measured: list[int] = []
+
+    def detect(*arguments: Any, **_: object) -> list[Pipe]:
+        measured.extend(view.stamp for view in arguments[3])
+        return []
+
+    monkeypatch.setattr(worker, "detect", detect)
+    commands = [*(worker.Keyframe(stamp, encoded, CAMERA) for stamp in range(5)), site]
+    connection = Mock(recv=Mock(side_effect=[*commands, EOFError]))
+    boq = BillOfQuantities((PipeClass("DN65", 0.0365, 3.0, (0.0, 0.0, 1.0), 4e-4),))
+    with pytest.raises(EOFError):
+        worker.serve(connection, DetectConfig(), boq, [], {})
+    assert measured == [0, 2, 4]
 
 
 def test_a_camera_that_stands_still_is_seen_twice() -> None:
