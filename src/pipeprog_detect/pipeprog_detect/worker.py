@@ -133,13 +133,12 @@ def serve(
             continue
         if command.camera is not None and keyframes.replace_camera(command.camera):
             memory = MeasurementCache()
-        views = list(_views(connection, command, keyframes))
+        views = list(_views(connection, command, keyframes, _measured_in(command, keyframes)))
         memory.next_map()
         if command.final:
             memory.novelty = MapChange()
         normals = None if command.normals is None else command.normals.astype(float)
         cloud = Cloud(command.points.astype(float), normals)
-        views = without_overlapping(views, cloud.points)
         boards = board_faces(command.circles.centres, command.circles.radii)
         try:
             pipes = detect(cloud, boq, config, views, memory=memory, boards=boards)
@@ -164,15 +163,24 @@ def _keep(command: Keyframe | Retire, keyframes: Keyframes, memory: MeasurementC
     memory.forget_views(command.stamps)
 
 
-def _views(connection: Connection, command: Map, keyframes: Keyframes) -> Iterator[View]:
-    """The keyframes of a map that can be decoded; says which one is, so that it is known if this process dies of it."""
-    for number, (stamp, pose) in enumerate(zip(command.stamps.tolist(), command.map_from_camera, strict=True)):
-        if stamp not in keyframes:
-            continue
+def _measured_in(command: Map, keyframes: Keyframes) -> list[int]:
+    """Numbers of the map's keyframes that are there, without those that a rolling shutter has for the motion alone."""
+    there = [number for number, stamp in enumerate(command.stamps.tolist()) if stamp in keyframes]
+    if command.velocities is None:
+        return there
+    poses = np.linalg.inv(command.map_from_camera)
+    views = [(poses[number], keyframes.camera(int(command.stamps[number]))) for number in there]
+    return [there[number] for number in without_overlapping(views, command.points.astype(float))]
+
+
+def _views(connection: Connection, command: Map, keyframes: Keyframes, numbers: Iterable[int]) -> Iterator[View]:
+    """Keyframes of a map, by number, that can be decoded; says which one is, lest this process die of it unnoticed."""
+    for number in numbers:
+        stamp = int(command.stamps[number])
         if not keyframes.is_decoded(stamp):
             connection.send(Decoding(stamp))
         try:
-            view = keyframes.view(stamp, pose)
+            view = keyframes.view(stamp, command.map_from_camera[number])
             if command.velocities is not None:
                 view = replace(view, rolled=command.velocities.rolled(number, keyframes.camera(stamp)))
             yield view
