@@ -25,7 +25,7 @@ from pipeprog_detect.silhouette.scene import Scene, viewing_direction
 from pipeprog_detect.thin.false_lines import is_false_line, is_one_step
 from pipeprog_detect.thin.hangers import is_hanger
 from pipeprog_detect.thin.longer_in_colour import longer_in_colour
-from pipeprog_detect.thin.thin_pipes import find_thin_pipes, in_colour, turned_parallel
+from pipeprog_detect.thin.thin_pipes import find_thin_pipes, in_colour, seeking_edges, turned_parallel
 from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
@@ -154,14 +154,18 @@ def detect_outside(
     faces = None if boards is None else boards - shift
     judging = with_depths(local_views, prepared.points, faces) if config.contour.enabled else []
     verifier = KeyframeVerifier(judging, boq, memory)
-    candidates = _candidates(prepared, boq, config, verifier, report, memory)
-    report(0.9, "measuring in the keyframes" if views else "measuring")
-    # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
-    criteria = seen_from_outside(prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier), config)
-    measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
-    measured = parted_by_walls(measured, around, judging, verifier)
-    judging, coloured = _with_blur(judging, measured), in_colour(judging)
     points = (prepared.points if judging else prepared.points[:0]).astype(np.float32)  # for what is judged in the views
+    thickest = max(THICKEST_LINE, _radius_in_window(judging))
+    edges = memory.edges if memory else {}
+    with seeking_edges(points, thickest, judging, boq, edges):
+        candidates = _candidates(prepared, boq, config, verifier, report, memory)
+        report(0.9, "measuring in the keyframes" if views else "measuring")
+        # With keyframes the cloud is trusted alone only where a pipe is as smooth in it as the walls are.
+        noise = prepared.sigma if verifier.has_views else _noise_on_pipes(prepared, verifier)
+        criteria = seen_from_outside(noise, config)
+        measured = verifier.measure(candidates, [criteria.accept(each) for each in candidates])
+        measured = parted_by_walls(measured, around, judging, verifier)
+    judging, coloured = _with_blur(judging, measured), in_colour(judging)
 
     def is_genuine(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
         return not is_false_line(each.cylinder, each.fit, points, around.planes, judging, others)
@@ -179,8 +183,6 @@ def detect_outside(
     )
     report(0.95, "looking for thin pipes in the keyframes")
     measured = longer_in_colour(measured, THICKEST_LINE, coloured)
-    edges = memory.edges if memory else {}
-    thickest = max(THICKEST_LINE, _radius_in_window(judging))
     lost = find_thin_pipes(points, around, thickest, measured, judging, boq, edges)
     measured += _genuine(lost, around, judging)
     measured = turned_parallel(measured, points, THICKEST_LINE, judging, boq)

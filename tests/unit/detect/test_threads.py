@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 
 import pytest
 
 from pipeprog_detect import threads
-from pipeprog_detect.threads import mapped
+from pipeprog_detect.threads import beside, mapped
 
 
 @pytest.mark.parametrize("cores", [1, 3])
@@ -31,3 +32,29 @@ def test_a_part_that_fails_ends_the_loop(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(threads, "THREADS", 2)
     with pytest.raises(ZeroDivisionError):
         mapped(lambda part: 1 // part, [1, 0, 2])
+
+
+def test_parts_are_worked_on_beside_the_block_and_no_longer() -> None:
+    """The block waits for the first of parts without end."""
+    first = threading.Event()
+    done: list[int] = []
+
+    def work(part: int) -> None:
+        done.append(part)
+        first.set()
+
+    with beside(work, itertools.count()):
+        assert first.wait(30.0)
+    assert done == list(range(len(done))) != []
+
+
+def test_what_fails_beside_a_block_fails_at_its_end() -> None:
+    reached = False
+    with pytest.raises(ZeroDivisionError), beside(lambda part: 1 // part, [0]):
+        reached = True
+    assert reached
+
+
+def test_a_block_that_fails_beside_others_fails_with_its_own_error() -> None:
+    with pytest.raises(KeyError), beside(lambda part: 1 // part, [0]):
+        raise KeyError

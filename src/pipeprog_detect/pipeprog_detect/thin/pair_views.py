@@ -68,11 +68,28 @@ def pair_views(
             shadows and seams look like thin pipes.
         edges: straight edges that earlier calls found, by stamp, width and whether in colour; new ones are added.
     """
-    seen = mapped(lambda view: _pair_view(view, points, radii, known, edges), _apart(views, points))
+    seen = mapped(lambda view: _pair_view(view, points, radii, known, edges), apart(views, points))
     return [each for each in seen if each is not None]
 
 
-def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
+def seek_edges(
+    view: View, points: NDArray[np.float32], radii: Sequence[float], edges: dict[tuple[int, int, bool], FloatArray]
+) -> None:
+    """Adds a view's straight edges to those found, for `pair_views` with these points and radii."""
+    sized = _sized(view, points, radii)
+    if sized is not None:
+        _edges_of(sized[0], view.is_in_colour, edges)
+
+
+def _edges_of(sized: View, is_in_colour: bool, edges: dict[tuple[int, int, bool], FloatArray]) -> FloatArray:
+    """Straight edges of a view at the size at which they are sought, those found before where there are any."""
+    key = (sized.stamp, sized.camera.width, is_in_colour)
+    if key not in edges:
+        edges[key] = straight_edges(sized.image)
+    return edges[key]
+
+
+def apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
     """Views of the cloud's points far enough from the last one to tell more than it did."""
     chosen: list[View] = []
     sparse = points[:: max(len(points) // ENOUGH_POINTS, 1)]
@@ -87,7 +104,7 @@ def _apart(views: Sequence[View], points: NDArray[np.float32]) -> list[View]:
 
 def distinct_views(views: Sequence[View], points: NDArray[np.float32], radii: Sequence[float]) -> list[View]:
     """Those of the views that tell more than the one before, as small as thin pipes of these radii [m] allow."""
-    sized = (_sized(view, points, radii) for view in _apart(views, points))
+    sized = (_sized(view, points, radii) for view in apart(views, points))
     return [each[0] for each in sized if each is not None]
 
 
@@ -115,7 +132,7 @@ def _pair_view(
     points: NDArray[np.float32],
     radii: Sequence[float],
     known: Sequence[Cylinder],
-    lines: dict[tuple[int, int, bool], FloatArray],
+    edges: dict[tuple[int, int, bool], FloatArray],
 ) -> PairView | None:
     sized = _sized(view, points, radii)
     if sized is None:
@@ -125,10 +142,8 @@ def _pair_view(
     near, middle, far = np.percentile(depth[:: max(len(depth) // ENOUGH_POINTS, 1)], [1, 50, 99])
     focal = view.camera.fx
     narrowest, widest = 2.0 * focal * min(radii) / far - WIDTH_SIGMA, 2.0 * focal * max(radii) / near + WIDTH_SIGMA
-    key = (view.stamp, view.camera.width, is_in_colour)
-    if key not in lines:
-        lines[key] = straight_edges(view.image)
-    found = segment_pairs(_at_the_stamp(lines[key], view, float(middle)), max(narrowest, 2.0), widest)
+    lines = _edges_of(view, is_in_colour, edges)
+    found = segment_pairs(_at_the_stamp(lines, view, float(middle)), max(narrowest, 2.0), widest)
     found = found.select(~between_outlines(found, known, view))
     behind = depth_of_cylinders(view, found.ends.reshape(-1, 2), cylinder_rows(known)).reshape(-1, 2)
     found = found.select(np.any(np.isinf(behind), axis=1))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -24,8 +25,9 @@ from pipeprog_detect.thin.false_lines import is_bare, is_false_line
 from pipeprog_detect.thin.line_fitter import LineFitter, turned
 from pipeprog_detect.thin.line_triangulation import propose
 from pipeprog_detect.thin.longer_in_colour import longer_in_colour
-from pipeprog_detect.thin.pair_views import PairView, distinct_views, pair_views
+from pipeprog_detect.thin.pair_views import PairView, apart, distinct_views, pair_views, seek_edges
 from pipeprog_detect.thin.parallel_directions import NEARLY_PARALLEL, PARALLEL_SIGMA, parallel_directions
+from pipeprog_detect.threads import beside
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_known, is_stub
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -66,7 +68,7 @@ def find_thin_pipes(
         boq: the bill of quantities.
         edges: straight edges that earlier calls found, as `pair_views` has them; new ones are added.
     """
-    radii = [radius for radius in boq.radii if radius < thickest]
+    radii = _radii(boq, thickest)
     if not views or not radii:
         return []
     known = [measured.cylinder for measured in found]
@@ -80,6 +82,31 @@ def find_thin_pipes(
     if coloured:
         search.by_lines(coloured, pair_views(coloured, search.some, radii, search.known, edges), again=views)
     return longer_in_colour(search.thin, thickest, coloured, known)
+
+
+def seeking_edges(
+    points: NDArray[np.float32],
+    thickest: float,
+    views: Sequence[View],
+    boq: BillOfQuantities,
+    edges: dict[tuple[int, int, bool], FloatArray],
+) -> AbstractContextManager[None]:
+    """While the block lasts another thread seeks edges that `find_thin_pipes` would; arguments as there."""
+    radii = _radii(boq, thickest)
+    if not views or not radii:
+        return nullcontext()
+    some = _some(points)
+    seen = apart(views, some)
+    return beside(lambda view: seek_edges(view, some, radii, edges), [*seen, *in_colour(seen)])
+
+
+def _radii(boq: BillOfQuantities, thickest: float) -> list[float]:
+    return [radius for radius in boq.radii if radius < thickest]
+
+
+def _some(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """As many of the points (N, 3) as depths need."""
+    return np.ascontiguousarray(points[:: max(-(-len(points) // MOST_POINTS), 1)])
 
 
 def in_colour(views: Sequence[View]) -> list[View]:
@@ -102,7 +129,7 @@ class _Search:
     @cached_property
     def some(self) -> NDArray[np.float32]:
         """Points of the cloud, as many as its depths need."""
-        return np.ascontiguousarray(self.points[:: -(-len(self.points) // MOST_POINTS)])
+        return _some(self.points)
 
     def along_known_pipes(self, views: Sequence[View], swept: Sequence[View], again: Sequence[View] = ()) -> None:
         """Those along the directions of the known pipes that views show, of which the `swept` ones are looked through.
@@ -200,7 +227,7 @@ def turned_parallel(
         views: the keyframes.
         boq: the bill of quantities.
     """
-    radii = [radius for radius in boq.radii if radius < thickest]
+    radii = _radii(boq, thickest)
     if not views or not radii:
         return list(measured)
     lines = LineFitter(views, points.astype(np.float32, copy=False), radii, boq)

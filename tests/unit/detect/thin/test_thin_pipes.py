@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +16,9 @@ from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.cloud.plane_segmentation import Plane
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.refinement.contour_fit import ContourFit
+from pipeprog_detect.thin import thin_pipes
 from pipeprog_detect.thin.line_fitter import LineFitter
-from pipeprog_detect.thin.thin_pipes import _Search, find_thin_pipes, is_shadow, turned_parallel
+from pipeprog_detect.thin.thin_pipes import _Search, find_thin_pipes, is_shadow, seeking_edges, turned_parallel
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
 from pipeprog_detect.verification.scene_context import SceneContext
@@ -102,6 +105,36 @@ def _raised(pose: FloatArray, by: float) -> FloatArray:
     return raised
 
 
+def before_a_wall(points: FloatArray | None = None) -> tuple[FloatArray, SceneContext]:
+    """The cloud of a wall, with what stands before it, and what is around."""
+    x, z = np.meshgrid(np.arange(-1.5, 1.5, 0.01), np.arange(-0.5, 1.0, 0.01))
+    wall = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    tree = octree.build(wall)
+    around = SceneContext(tree, None, [Plane(np.array([0.0, -1.0, 0.0]), 0.0, 4.5)], tree, 1e-3)
+    return wall if points is None else np.vstack([wall, points]), around
+
+
+def test_edges_that_are_sought_beforehand_are_those_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = walk_past([cylinder([-0.45, -0.08, 0.02], [0.45, -0.08, 0.02], 0.0086, CONCRETE)])
+    cloud, around = before_a_wall()
+    needed: dict[tuple[int, int, bool], FloatArray] = {}
+    find_thin_pipes(cloud, around, 0.02, [], views, BOQ, needed)
+
+    def at_once(function: Callable[[View], object], parts: list[View]) -> nullcontext[None]:
+        for part in parts:
+            function(part)
+        return nullcontext()
+
+    monkeypatch.setattr(thin_pipes, "beside", at_once)
+    found: dict[tuple[int, int, bool], FloatArray] = {}
+    with seeking_edges(cloud.astype(np.float32), 0.02, views, BOQ, found):
+        pass
+    assert found.keys() == needed.keys()
+    assert {is_in_colour for *_, is_in_colour in found} == {False, True}
+    for key, edges in found.items():
+        np.testing.assert_array_equal(edges, needed[key])
+
+
 @pytest.mark.parametrize("rise", [0.0, 0.4])
 def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour(rise: float) -> None:
     """Grey shows the wall as it is without the pipe, which runs along known ones or, if it rises, along none."""
@@ -110,10 +143,7 @@ def test_a_pipe_as_bright_as_the_wall_is_found_by_its_colour(rise: float) -> Non
     grey = [replace(view, chromaticity=None) for view in walk_past([])]
     coloured = walk_past([cylinder(pipe.start, pipe.end, pipe.radius, copper)])
     views = [replace(view, chromaticity=other.chromaticity) for view, other in zip(grey, coloured, strict=True)]
-    x, z = np.meshgrid(np.arange(-1.5, 1.5, 0.01), np.arange(-0.5, 1.0, 0.01))
-    wall = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
-    cloud, tree = np.vstack([wall, front_points(pipe)]), octree.build(wall)
-    around = SceneContext(tree, None, [Plane(np.array([0.0, -1.0, 0.0]), 0.0, 4.5)], tree, 1e-3)
+    cloud, around = before_a_wall(front_points(pipe))
     above = [Cylinder(np.array([-1.0, y, 3.0]), np.array([1.0, y, 3.0]), 0.05) for y in (-0.1, -0.3, -0.5)]
     known = [measured(each, 100.0) for each in above]
     assert find_thin_pipes(cloud, around, 0.02, known, grey, BOQ, {}) == []
