@@ -10,7 +10,7 @@ import pytest
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense import dense_mapper
-from pipeprog_sfm.dense.dense_mapper import GIVEN_UP, OUTDATED, DenseMapper, Registered
+from pipeprog_sfm.dense.dense_mapper import GIVEN_UP, OUTDATED, STILL, DenseMapper, Registered
 from pipeprog_sfm.types import EncodedImage
 
 WIDTH, HEIGHT = 240, 160
@@ -159,6 +159,25 @@ def test_only_the_depth_maps_of_an_earlier_camera_are_made_anew() -> None:
     assert len(dense) == whole
     cloud = dense.fuse(poses, poses, 1.0, complete=True, anew=True).result()
     assert np.median(np.abs(cloud.points[:, 2] - 1.0)) < 0.003
+
+
+@pytest.mark.parametrize(
+    ("is_rolling", "newest", "expected"), [(False, 2, 1), (True, 2, 0), (True, 3, 0), (True, 4, 1)]
+)
+def test_with_a_rolling_shutter_depth_maps_wait_for_the_frames_between(
+    is_rolling: bool, newest: int, expected: int
+) -> None:
+    """Keyframes that are a second apart; those between would come up to three seconds later."""
+    stamps = [number * 10**9 for number in range(newest + 1)]
+    poses = {stamp: pose(4 * number) for number, stamp in enumerate(stamps)}
+    images = {stamp: image(4 * number) for number, stamp in enumerate(stamps)}
+    motions = dict.fromkeys(stamps, STILL) if is_rolling else {}
+    keyframes = Registered(poses, images, lambda other: seen(poses[other]), motions)
+    dense = DenseMapper(StereoConfig(), FusionConfig())
+    dense.update(keyframes, complete=False)
+    assert len(dense) == expected
+    dense.update(keyframes, complete=True)
+    assert len(dense) > expected
 
 
 def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
