@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
@@ -18,7 +19,7 @@ OVERLAP = 0.85
 SAMPLE = 4000
 
 
-def without_overlapping(views: Sequence[tuple[FloatArray, Camera]], points: FloatArray) -> list[int]:
+def without_overlapping(views: Sequence[tuple[FloatArray, Camera]], points: NDArray[np.floating]) -> list[int]:
     """Numbers of the views of a rolling shutter without those that both neighbours kept show enough of.
 
     They are denser in time than their overlap asks for: poses between them tell how the camera moves. A detector that
@@ -28,7 +29,7 @@ def without_overlapping(views: Sequence[tuple[FloatArray, Camera]], points: Floa
         views: camera_from_map (4, 4) and calibration of each, in order of time.
         points: of the cloud (N, 3), in the frame of the views [m].
     """
-    seen = in_image(points[:: max(len(points) // SAMPLE, 1)], views)
+    seen = in_image(points[:: max(len(points) // SAMPLE, 1)].astype(float), views)
     kept: list[int] = []
     for number in range(len(views)):
         if kept and number + 1 < len(views):

@@ -170,7 +170,7 @@ def _measured_in(command: Map, keyframes: Keyframes) -> list[int]:
         return there
     poses = np.linalg.inv(command.map_from_camera)
     views = [(poses[number], keyframes.camera(int(command.stamps[number]))) for number in there]
-    return [there[number] for number in without_overlapping(views, command.points.astype(float))]
+    return [there[number] for number in without_overlapping(views, command.points)]
 
 
 def _views(connection: Connection, command: Map, keyframes: Keyframes, numbers: Iterable[int]) -> Iterator[View]:
