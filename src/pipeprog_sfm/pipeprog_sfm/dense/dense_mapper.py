@@ -40,7 +40,7 @@ SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits f
 PICTURES = 12  # of keyframes at working resolution, 15 MB each at 720p: neighbours are mostly the last few
 NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
-# A keyframe of which the newest one sees less than this share is left behind: no nearer one comes any more.
+# A keyframe of which the newest one considered sees less than this share is left behind: no nearer one comes any more.
 LEFT_BEHIND = 0.5
 # Share of a keyframe's points that too few depth maps show, from which on it gets its own: that is what the margins of
 # a swaying image show. The sample of its points tells it with a standard deviation of 0.014.
@@ -151,7 +151,8 @@ class DenseMapper:
             grown = len(keyframes) > 1.1 * self._refused.get(stamp, 0) + 2
             if stamp not in self._depths and stamp not in self._covered and (grown or complete):
                 self._consider(stamp, keyframes)
-        self._settle(keyframes, complete)
+        if ready:
+            self._settle(keyframes, ready[-1], complete)
         self._submit(all_of_them=complete)
 
     def start_waiting(self) -> None:
@@ -215,18 +216,18 @@ class DenseMapper:
             return
         self._start(stamp, keyframes, points)
 
-    def _settle(self, keyframes: Registered, complete: bool) -> None:
+    def _settle(self, keyframes: Registered, newest: int, complete: bool) -> None:
         """Starts depth maps of covered keyframes that show, at a margin, what too few others show.
 
-        That is known once the walk has left behind what they show, or is complete.
+        That is known once the walk has left behind what they show, or is complete. `newest` is the stamp up to which
+        the keyframes have been considered: a later one may yet get a depth map that shows the margin.
         """
         while self._unsettled:
             stamp = self._unsettled[0]
             if stamp in self._covered and stamp in keyframes:
                 points = keyframes.in_front(stamp)
                 own = sample(points)
-                newest = keyframes.view(max(keyframes.poses))
-                if not complete and in_image(own, [newest]).mean() > LEFT_BEHIND:
+                if not complete and in_image(own, [keyframes.view(newest)]).mean() > LEFT_BEHIND:
                     return
                 mapped = [keyframes.view(other) for other in self._depths if other in keyframes]
                 missed = in_image(own, mapped).sum(axis=0) < self._fusion_config.min_views

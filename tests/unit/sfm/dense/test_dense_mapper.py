@@ -198,3 +198,19 @@ def test_a_depth_map_may_be_retired_while_a_cloud_of_it_is_awaited() -> None:
     cloud = dense.fuse(poses, poses, 1.0, complete=True, anew=True)
     dense.retire([max(poses)])
     assert len(cloud.result().points) > 1000
+
+
+def test_a_margin_is_judged_once_what_may_show_it_has_been_considered() -> None:
+    """A walk whose keyframes all wait for those between gets as many depth maps as one that waits for none."""
+    places = list(range(24))
+    rolling, still = DenseMapper(StereoConfig(), FusionConfig()), walk(places)[0]
+    stamps = [250_000_000 * place for place in places]
+    poses = {stamp: pose(place) for stamp, place in zip(stamps, places, strict=True)}
+    images = {stamp: image(place) for stamp, place in zip(stamps, places, strict=True)}
+    for count in range(1, len(stamps) + 1):
+        known = {stamp: poses[stamp] for stamp in stamps[:count]}
+        motions = dict.fromkeys(known, STILL)
+        rolling.update(
+            Registered(known, images, lambda other: seen(poses[other]), motions), complete=count == len(stamps)
+        )
+    assert len(rolling) == len(still)
