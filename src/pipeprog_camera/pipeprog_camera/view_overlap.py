@@ -14,6 +14,9 @@ from pipeprog_camera.camera import Camera
 SAMPLE = 200  # points of a view from which its overlap with others is estimated, to 0.04
 SAME_SIDE = np.radians(8.0)  # between rays to a point; beyond (baseline 0.14 of the depth) a view adds information
 SAME_SCALE = 1.5  # ratio of depths; a view that is nearer by more shows more detail
+# Share of what a view of a rolling shutter shows that those before and after it must show as well where it came for the
+# motion alone: as much as those of a global shutter overlap, where none is chosen for that (frames.overlap_min).
+FOR_THE_MOTION = 0.85
 
 
 def sample(points: FloatArray) -> FloatArray:
@@ -38,6 +41,15 @@ def view_overlap(
     seen &= (np.einsum("vki,ki->vk", rays, rays[0]) > np.cos(SAME_SIDE))[1:]
     seen &= depth.T[1:] < SAME_SCALE * depth.T[0]
     return np.asarray(seen.mean(axis=1), np.float64)
+
+
+def shown_beside(points: FloatArray, before: tuple[FloatArray, Camera], after: tuple[FloatArray, Camera]) -> bool:
+    """Whether the views before and after one, of a rolling shutter, both show enough of the (K, 3) points of that one.
+
+    Keyframes of a rolling shutter are denser in time than their overlap asks for: poses between them tell how the
+    camera moves. Measured in all of them, a scene takes longer, and is the same.
+    """
+    return bool(len(points)) and bool(in_image(points, [before, after]).all(axis=0).mean() >= FOR_THE_MOTION)
 
 
 def in_image(points: FloatArray, views: Sequence[tuple[FloatArray, Camera]]) -> NDArray[np.bool_]:

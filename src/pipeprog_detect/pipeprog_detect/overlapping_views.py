@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.view_overlap import in_image
+from pipeprog_camera.view_overlap import in_image, shown_beside
 
-# Share of what a keyframe shows that the ones before and after it must show as well: as much as keyframes of a global
-# shutter overlap, where none is chosen for the motion (frames.overlap_min).
-OVERLAP = 0.85
 # Points of the cloud that tell it: of the 500 or more in an image, to 0.02.
 SAMPLE = 4000
 
@@ -29,12 +26,10 @@ def without_overlapping(views: Sequence[tuple[FloatArray, Camera]], points: NDAr
         views: camera_from_map (4, 4) and calibration of each, in order of time.
         points: of the cloud (N, 3), in the frame of the views [m].
     """
-    seen = in_image(points[:: max(len(points) // SAMPLE, 1)].astype(float), views)
+    some = points[:: max(len(points) // SAMPLE, 1)].astype(float)
     kept: list[int] = []
-    for number in range(len(views)):
-        if kept and number + 1 < len(views):
-            both = seen[kept[-1]] & seen[number + 1]
-            if np.count_nonzero(both & seen[number]) >= OVERLAP * max(np.count_nonzero(seen[number]), 1):
-                continue
-        kept.append(number)
+    for number, seen in enumerate(in_image(some, views)):
+        is_between = bool(kept) and number + 1 < len(views)
+        if not is_between or not shown_beside(some[seen], views[kept[-1]], views[number + 1]):
+            kept.append(number)
     return kept

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RowVelocities
+from pipeprog_camera.view_overlap import FOR_THE_MOTION
 from pipeprog_detect import worker
 from pipeprog_detect.config import DetectConfig
-from pipeprog_detect.overlapping_views import OVERLAP, without_overlapping
+from pipeprog_detect.overlapping_views import without_overlapping
 from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.types import Pipe
 
@@ -91,10 +92,10 @@ def test_views_before_which_there_is_nothing_stay() -> None:
 
 @given(st.lists(st.floats(0.0, 0.3), min_size=1, max_size=25))
 def test_neighbours_that_stay_overlap_by_enough_or_were_neighbours(steps: list[float]) -> None:
-    """Whatever the walk: nothing between two that stay shows more than 1 - OVERLAP beside them."""
+    """Whatever the walk: nothing between two that stay shows more than 1 - FOR_THE_MOTION beside them."""
     places = np.cumsum(steps) * SEEN / 4.0
     stay = kept(places.tolist())
     assert {0, len(places) - 1} <= set(stay)
     for first, second in pairwise(stay):
         apart = (places[second] - places[first]) / SEEN
-        assert second == first + 1 or apart <= 1.0 - OVERLAP + 0.02  # of a sample of points
+        assert second == first + 1 or apart <= 1.0 - FOR_THE_MOTION + 0.02  # of a sample of points

@@ -18,7 +18,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
-from pipeprog_camera.view_overlap import in_image, sample, view_overlap
+from pipeprog_camera.view_overlap import in_image, sample, shown_beside, view_overlap
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
 from pipeprog_sfm.dense.stereo import (
@@ -113,7 +113,8 @@ class DenseMapper:
     """Depth maps and their fusion, in one thread of low priority beside the mapper.
 
     A keyframe gets a depth map unless another one shows nearly the same, and in the end enough of them what it shows at
-    its margins: what is held grows with the map, not with the time spent in it. Depth maps are made in the order of the
+    its margins: what is held grows with the map, not with the time spent in it. So it is, with a rolling shutter, with
+    keyframes that came for the motion: those beside them show what they show. Depth maps are made in the order of the
     calls with the poses of the call, so that the result does not depend on timing.
     """
 
@@ -127,6 +128,7 @@ class DenseMapper:
         self._waiting: deque[Callable[[], None]] = deque()
         self._submitted: deque[Future[None]] = deque()
         self._covered: dict[int, int] = {}  # keyframes without a depth map, and the one that shows the same
+        self._between: set[int] = set()  # of these, those that came for the motion
         self._unsettled: deque[int] = deque()  # of these, those whose surroundings have not all got theirs
         self._shift = 0.0  # px, at most: by which the camera has changed since the first keyframe
         self._started_at: dict[int, float] = {}  # that shift when a depth map was started
@@ -169,6 +171,7 @@ class DenseMapper:
                 del self._started_at[stamp]
         for stamp in [stamp for stamp, other in self._covered.items() if other in stamps]:
             del self._covered[stamp]
+        self._between &= self._covered.keys()
 
     def change_camera(self, shift: float) -> None:
         """Notes that another calibration or read-out moves a point of the images by `shift` px at most.
@@ -203,10 +206,24 @@ class DenseMapper:
                 maps[stamp] = (future, pose)
         return self._thread.submit(self._fuse, maps, dict(camera_from_model), scale, anew)
 
+    def _beside(self, stamp: int, points: FloatArray, keyframes: Registered) -> int | None:
+        """The keyframe before one of a rolling shutter that came for the motion; None for another, or a global one."""
+        before = max((each for each in keyframes.poses if each < stamp and each not in self._between), default=None)
+        after = min((each for each in keyframes.poses if each > stamp), default=None)
+        if not keyframes.motions or before is None or after is None:
+            return None
+        return before if shown_beside(points, keyframes.view(before), keyframes.view(after)) else None
+
     def _consider(self, stamp: int, keyframes: Registered) -> None:
         points = keyframes.in_front(stamp)
         if len(points) < MIN_POINTS:
             self._refused[stamp] = len(keyframes)
+            return
+        before = self._beside(stamp, points, keyframes)
+        if before is not None:
+            self._covered[stamp] = before
+            self._between.add(stamp)
+            self._unsettled.append(stamp)
             return
         mapped = [other for other in self._depths if other in keyframes]
         seen = view_overlap(sample(points), keyframes.poses[stamp], [keyframes.view(other) for other in mapped])
@@ -233,6 +250,7 @@ class DenseMapper:
                 missed = in_image(own, mapped).sum(axis=0) < self._fusion_config.min_views
                 if missed.sum() > MARGIN * len(own):
                     del self._covered[stamp]
+                    self._between.discard(stamp)
                     self._start(stamp, keyframes, points)
             self._unsettled.popleft()
 

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeprog_camera import view_overlap
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense import dense_mapper
@@ -54,6 +55,19 @@ def walk(places: list[int]) -> tuple[DenseMapper, dict[int, np.ndarray], list[in
         counts.append(len(dense))
     dense.update(Registered(poses, images, lambda other: seen(poses[other])), complete=True)
     return dense, poses, [*counts, len(dense)]
+
+
+def rolling_walk(count: int) -> DenseMapper:
+    """The mapper after as many keyframes of a rolling shutter, 0.25 s apart: depth maps wait for 3 s."""
+    dense = DenseMapper(StereoConfig(), FusionConfig())
+    poses: dict[int, np.ndarray] = {}
+    images = {}
+    for place in range(count):
+        stamp = 250_000_000 * place
+        poses[stamp], images[stamp] = pose(place), image(place)
+        keyframes = Registered(poses, images, lambda other: seen(poses[other]), dict.fromkeys(poses, STILL))
+        dense.update(keyframes, complete=place + 1 == count)
+    return dense
 
 
 @pytest.fixture(scope="module")
@@ -180,6 +194,31 @@ def test_with_a_rolling_shutter_depth_maps_wait_for_the_frames_between(
     assert len(dense) > expected
 
 
+def test_with_a_rolling_shutter_margins_wait_for_the_keyframes_around() -> None:
+    assert len(rolling_walk(24)) == len(walk(list(range(24)))[0])
+
+
+def test_keyframes_that_came_for_the_motion_get_no_depth_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each shows the wall from another side, but those before and after it show the same of it."""
+    monkeypatch.setattr(view_overlap, "SAME_SIDE", np.radians(3.0))  # a step turns the sights by 4 degrees
+    ends = 8  # views that show a point of the wall's ends too seldom
+    assert len(walk(list(range(24)))[0]) == 24
+    assert len(rolling_walk(24)) <= 12 + ends // 2
+
+
+def test_a_keyframe_that_came_for_the_motion_stands_in_for_those_retired() -> None:
+    dense = rolling_walk(24)
+    stamps = [250_000_000 * place for place in range(24)]
+    retired = [stamps[10], stamps[12]]
+    dense.retire(retired)
+    before = len(dense)
+    poses = {stamp: pose(place) for place, stamp in enumerate(stamps) if stamp not in retired}
+    images = {stamp: image(place) for place, stamp in enumerate(stamps)}
+    keyframes = Registered(poses, images, lambda other: seen(poses[other]), dict.fromkeys(poses, STILL))
+    dense.update(keyframes, complete=True)
+    assert len(dense) == before + 1
+
+
 def test_a_retired_depth_map_is_made_again_from_a_neighbour() -> None:
     places = [place for place in range(8) for _ in range(2)]
     dense, poses, counts = walk(places)
@@ -198,19 +237,3 @@ def test_a_depth_map_may_be_retired_while_a_cloud_of_it_is_awaited() -> None:
     cloud = dense.fuse(poses, poses, 1.0, complete=True, anew=True)
     dense.retire([max(poses)])
     assert len(cloud.result().points) > 1000
-
-
-def test_a_margin_is_judged_once_what_may_show_it_has_been_considered() -> None:
-    """A walk whose keyframes all wait for those between gets as many depth maps as one that waits for none."""
-    places = list(range(24))
-    rolling, still = DenseMapper(StereoConfig(), FusionConfig()), walk(places)[0]
-    stamps = [250_000_000 * place for place in places]
-    poses = {stamp: pose(place) for stamp, place in zip(stamps, places, strict=True)}
-    images = {stamp: image(place) for stamp, place in zip(stamps, places, strict=True)}
-    for count in range(1, len(stamps) + 1):
-        known = {stamp: poses[stamp] for stamp in stamps[:count]}
-        motions = dict.fromkeys(known, STILL)
-        rolling.update(
-            Registered(known, images, lambda other: seen(poses[other]), motions), complete=count == len(stamps)
-        )
-    assert len(rolling) == len(still)
