@@ -112,9 +112,11 @@ def refine(
         step = step + found.step
     if found is not None and start.ends_known:
         found = without_bend(found, start.cylinder, priors[-1])
-    if found is not None and follow:
+    if found is None or found.share < MIN_SUPPORT:  # nothing that goes on: what is hardly seen is not followed
+        return None
+    if follow:
         found = followed(found, start.cylinder, priors[-1], held)
-    if found is None or found.share < MIN_SUPPORT or found.is_within_blur:
+    if found.share < MIN_SUPPORT or found.is_within_blur:
         return None
     surface = start.cylinder if start.ends_known else None
     return contour_fit(found, find_ends(found.scene, surface) if follow else (None, None))

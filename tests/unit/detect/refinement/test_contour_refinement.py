@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from pipeprog_camera.camera import Camera
-from pipeprog_detect.refinement.contour_adjustment import LEAST_IN_VIEW, adjusted
+from pipeprog_detect.refinement import contour_refinement
+from pipeprog_detect.refinement.contour_adjustment import LEAST_IN_VIEW, AdjustedCylinder, adjusted
 from pipeprog_detect.refinement.contour_refinement import Start, refine
+from pipeprog_detect.refinement.extension import followed
 from pipeprog_detect.refinement.global_search import MOST_SAMPLES, best_steps
 from pipeprog_detect.silhouette.scene import Scene, frame
 from pipeprog_detect.types import Cylinder, View
@@ -131,6 +134,24 @@ def test_nothing_to_see_is_no_measurement(empty_views: list[View]) -> None:
     assert refine(Start(PIPE, 0.004), [], []) is None
     above = Cylinder(PIPE.start + 3.0 * UP, PIPE.end + 3.0 * UP, PIPE.radius)
     assert refine(Start(above, 0.004), empty_views, []) is None
+
+
+def test_what_is_hardly_seen_is_not_followed(
+    pipe_views: list[View], empty_views: list[View], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would take as long again, of most lines that are no pipes."""
+    lengths = []
+
+    def noted(known: AdjustedCylinder, *others: Any) -> AdjustedCylinder:
+        lengths.append(known.cylinder.length)
+        return followed(known, *others)
+
+    monkeypatch.setattr(contour_refinement, "followed", noted)
+    start = Start(PIPE, PIPE.radius, radius_known=True, depth_sigma=0.03)
+    assert refine(start, empty_views, []) is None
+    assert not lengths
+    assert refine(start, pipe_views, []) is not None
+    assert lengths
 
 
 def test_a_wrong_radius_and_an_empty_wall_have_no_support(pipe_views: list[View], empty_views: list[View]) -> None:
