@@ -284,6 +284,7 @@ class SfmNode(Node):
         reference = declare_fixed(self, "reference", "", "map.npz of the survey in whose frame the map is to lie")
         earlier = read_map(Path(reference)) if reference else None
         self._arguments = config, load_board_file(board) if board else BoardFile(), intermediate, earlier
+        self._has_started = False  # a worker
         self._colmap = declare_fixed(self, "colmap", "", "folder for the sparse model, beside which map.npz goes")
         self._lockstep = declare_fixed(self, "lockstep", False, "every message counts, as in a replay")
         publish_tf = declare_fixed(self, "publish_tf", False, "publish map -> camera of the keyframes on /tf")
@@ -387,7 +388,9 @@ class SfmNode(Node):
                 self._supervision.request(Finish(self._motion.take(), self._colmap))
 
     def _start_worker(self, answered: Iterable[AddKeyframe | Retire]) -> WorkerProcess:
-        return WorkerProcess(self, serve, (*self._arguments, answered), self._on_event, self._on_death)
+        # Where one has died of an image, the next ones must tell of which.
+        ahead, self._has_started = not self._has_started, True
+        return WorkerProcess(self, serve, (*self._arguments, ahead, answered), self._on_event, self._on_death)
 
     def _on_event(self, event: Event) -> None:
         if isinstance(event, Ready):

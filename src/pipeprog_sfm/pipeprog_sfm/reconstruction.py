@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.encoded_image import encoded_size
 from pipeprog_camera.errors import InputError
 from pipeprog_camera.rolled_image import RowVelocities
 from pipeprog_camera.rolling_shutter import RowMotion
@@ -28,6 +26,7 @@ from pipeprog_sfm.config import NOT_TOLD, SfmConfig
 from pipeprog_sfm.deblur import Deblurrer
 from pipeprog_sfm.dense.dense_mapper import DenseMapper, Registered, centre
 from pipeprog_sfm.dense.depth_fusion import FusedCloud
+from pipeprog_sfm.features.images_ahead import ImagesAhead
 from pipeprog_sfm.metric.metric_tracker import MetricTracker
 from pipeprog_sfm.metric.scale import DISAGREEMENT, NoScaleError, ScaleEstimate
 from pipeprog_sfm.metric.scale_sources import SOURCES, ScaleSource
@@ -116,6 +115,7 @@ class Reconstruction:
         self._mapper = Mapper(config.mapper, config.seed, readout=told or 0.0)
         self._map = self._mapper.map
         self._config = config
+        self._ahead = ImagesAhead(config.mapper)
         self._deblurrer = Deblurrer(config)
         self._metric_tracker = MetricTracker(board_file, config.board, config.odometry, sources)
         self._camera = CameraInUse(config.calibration, told)
@@ -133,25 +133,22 @@ class Reconstruction:
         self._alignment: Alignment | None = None
         self._not_aligned = ""
 
+    def expect(self, stamp: int, encoded: bytes, camera: Camera) -> None:
+        """Has the image of a keyframe that will be added prepared beside what is done till then; from any thread."""
+        self._ahead.expect(stamp, encoded, self._camera.of(camera))
+
     def add(self, stamp: int, encoded: bytes, camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe (JPEG or PNG bytes, stamp in ns, the camera's frame); InputError when it cannot be used."""
         if stamp in self._map.keyframes:
+            self._ahead.forget(stamp)
             raise InputError("a keyframe of this stamp has been taken already: it is left out")
-        encoded_size(encoded)  # before it is decoded
-        gray = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
-        if gray is None:
-            raise InputError("the image is damaged: it is left out")
-        if gray.shape != (camera.height, camera.width):
-            raise InputError(
-                f"the image has {gray.shape[1]} x {gray.shape[0]} pixels, its CameraInfo says "
-                f"{camera.width} x {camera.height}: calibrate at the size that the camera sends"
-            )
-        camera = self._camera.of(camera)
+        told, camera = camera, self._camera.of(camera)
+        image = self._ahead.take(stamp, encoded, told, camera)
         self._images[stamp] = EncodedImage(encoded, camera)
         self._alignment = None  # it is of the last final map
         # Features and boards are measured in the image as it is: their points are undistorted, not resampled.
-        self._sightings += bool(self._metric_tracker.add(stamp, gray, camera, frame))
-        report = self._mapper.add(stamp, gray, camera, frame)
+        self._sightings += bool(self._metric_tracker.add(stamp, image.gray, camera, frame))
+        report = self._mapper.add(stamp, image.gray, camera, frame, image.features)
         poses = self._map.camera_from_model()
         for other, features in self._deblurrer.deblurred(stamp, self._images[stamp], poses, self._map.points_seen):
             self._mapper.replace_features(other, features)

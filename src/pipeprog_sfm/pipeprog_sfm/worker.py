@@ -24,6 +24,7 @@ from pipeprog_sfm.alignment.map_file import MAP_FILE, write_map
 from pipeprog_sfm.alignment.survey_map import SurveyMap
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.inbox import Inbox
 from pipeprog_sfm.metric.transform_tree import RobotMotion
 from pipeprog_sfm.reconstruction import MetricMap, NotMetricError, Reconstruction, Status, Trajectory
 from pipeprog_sfm.sparse.overlap import OverlapReport
@@ -138,15 +139,24 @@ def serve(
     board_file: BoardFile,
     intermediate: bool,
     reference: SurveyMap | None,
+    ahead: bool,
     answered: Iterable[AddKeyframe | Retire],
 ) -> None:
     """Processes commands from `connection` until it closes; those that a predecessor has answered come first.
 
     Without `intermediate`, the only map is the one that Finish asks for, in the frame of the reference if there is one.
+    With `ahead`, images that have come are prepared while the ones before are worked off. Should the process die of one
+    of them, it is not told of which.
     """
     warm_up(config)
     reconstruction = Reconstruction(config, board_file, reference=reference)
-    work(connection, reconstruction, config.map_interval if intermediate else None, answered)
+
+    def expect(command: Command) -> None:
+        if isinstance(command, AddKeyframe):
+            reconstruction.expect(command.stamp, command.encoded, command.camera)
+
+    channel: Channel = Inbox(connection, expect) if ahead else connection
+    work(channel, reconstruction, config.map_interval if intermediate else None, answered)
 
 
 def work(

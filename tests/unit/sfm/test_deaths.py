@@ -22,6 +22,7 @@ class Idle:
     """Stands for a worker; takes commands and does nothing."""
 
     def __init__(self, node: object, serve: object, arguments: tuple[Any, ...], *callbacks: object) -> None:
+        self.ahead: bool = arguments[-2]
         self.record: Iterable[AddKeyframe | Retire] = arguments[-1]
         self.sent: list[object] = []
 
@@ -80,6 +81,20 @@ def test_a_keyframe_that_kills_is_left_out_and_the_rest_is_worked_off(replay: Re
     replay.keyframe(4, b"kills")
     assert [command.stamp for command in replay.worker.sent] == [3]
     assert replay.answers[-1] == (3, 0)
+
+
+def test_only_the_first_worker_prepares_images_ahead(replay: Replay) -> None:
+    """The first death may be of an image that was not in work yet; then the one in work is not left out for it."""
+    assert replay.worker.ahead
+    for stamp, encoded in ((1, b"good"), (2, b"kills")):
+        replay.keyframe(stamp, encoded)
+    replay.die()
+    assert not replay.worker.ahead
+    assert [command.stamp for command in replay.worker.sent] == [1, 2]
+    replay.node._on_event(KeyframeDone(1, "camera", Status(), [], None))
+    replay.die()
+    assert not replay.worker.ahead
+    assert [command.stamp for command in replay.worker.sent] == [2]
 
 
 def test_a_last_map_that_kills_is_answered_with_the_reason(replay: Replay, monkeypatch: pytest.MonkeyPatch) -> None:

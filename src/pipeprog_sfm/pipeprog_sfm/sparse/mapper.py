@@ -75,12 +75,29 @@ class Mapper:
         self._localizer = Localizer(self.map.keyframes, self._retrieval, seed)
         self._retired: dict[int, Keyframe] = {}
 
-    def add(self, stamp: int, gray: NDArray[np.uint8], camera: Camera, frame: str = "") -> KeyframeReport:
-        """Takes a keyframe: (H, W) uint8 as the camera saw it, stamp in ns; features of a retired one are reused."""
+    def add(
+        self,
+        stamp: int,
+        gray: NDArray[np.uint8],
+        camera: Camera,
+        frame: str = "",
+        features: Features | None = None,
+    ) -> KeyframeReport:
+        """Takes a keyframe; features of a retired one are reused.
+
+        Args:
+            stamp: of the keyframe [ns].
+            gray: (H, W) uint8 image as the camera saw it.
+            camera: calibration.
+            frame: name of the camera's optical frame.
+            features: of the image, where they have been extracted already.
+        """
         known = self._retired.pop(stamp, None)
         if known is not None:
-            return self.add_features(stamp, known.measured_features(), camera, frame)
-        return self.add_features(stamp, self._extract(gray, camera, self._config), camera, frame)
+            features = known.measured_features()
+        if features is None:
+            features = self._extract(gray, camera, self._config)
+        return self.add_features(stamp, features, camera, frame)
 
     def add_features(self, stamp: int, features: Features, camera: Camera, frame: str = "") -> KeyframeReport:
         """Takes a keyframe whose features are known; frame: of its camera."""
