@@ -40,7 +40,7 @@ SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits f
 PICTURES = 12  # of keyframes at working resolution, 15 MB each at 720p: neighbours are mostly the last few
 NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
-# A keyframe of which the newest one considered sees less than this share is left behind: no nearer one comes any more.
+# A keyframe of which the newest one sees less than this share is left behind: no nearer one comes any more.
 LEFT_BEHIND = 0.5
 # Share of a keyframe's points that too few depth maps show, from which on it gets its own: that is what the margins of
 # a swaying image show. The sample of its points tells it with a standard deviation of 0.014.
@@ -154,7 +154,7 @@ class DenseMapper:
             if stamp not in self._depths and stamp not in self._covered and (grown or complete):
                 self._consider(stamp, keyframes)
         if ready:
-            self._settle(keyframes, ready[-1], complete)
+            self._settle(keyframes, stamps[: len(ready) + LOOKAHEAD][-1], complete)
         self._submit(all_of_them=complete)
 
     def start_waiting(self) -> None:
@@ -236,8 +236,8 @@ class DenseMapper:
     def _settle(self, keyframes: Registered, newest: int, complete: bool) -> None:
         """Starts depth maps of covered keyframes that show, at a margin, what too few others show.
 
-        That is known once the walk has left behind what they show, or is complete. `newest` is the stamp up to which
-        the keyframes have been considered: a later one may yet get a depth map that shows the margin.
+        That is known once the walk has left behind what they show, or is complete. `newest`: stamp of the keyframe that
+        those considered have waited for; a later one may yet get a depth map that shows the margin.
         """
         while self._unsettled:
             stamp = self._unsettled[0]
