@@ -44,7 +44,7 @@ class RolledImage:
         lens = [self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy]
         return np.concatenate([lens, [second - first, first], self.motion.rates.ravel()])
 
-    @property
+    @cached_property
     def rows(self) -> FloatArray:
         """Coefficients (_DEGREE + 1, _DEGREE + 1) of the rows of the lens, (0, 0) without distortion; for kernels."""
         return _lens_rows(self.camera)
@@ -68,8 +68,7 @@ class RolledImage:
             directions: unit vectors (N, 2) each.
             depths: (N,) of what is seen there and beside it, along the optical axis.
         """
-        steps = [0.5 * (self.shown(pixels + one, depths) - self.shown(pixels - one, depths)) for one in directions]
-        return self.shown(pixels, depths), *steps
+        return tuple(_shown_beside(pixels, np.stack(directions), depths, self.numbers, self.rows))
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,14 @@ def row_of(u: float, v: float, numbers: FloatArray, rows: FloatArray) -> float:
 @njit(cache=True, nogil=True)
 def shown_at(u: float, v: float, depth: float, numbers: FloatArray, rows: FloatArray) -> tuple[float, float]:
     """Where the image shows what lies at pixel (u, v) at the stamp; `numbers` and `rows` of `RolledImage`."""
-    column, line = u, v
+    return _shown_near(u, v, u, v, depth, numbers, rows)
+
+
+@njit(cache=True, nogil=True)
+def _shown_near(
+    column: float, line: float, u: float, v: float, depth: float, numbers: FloatArray, rows: FloatArray
+) -> tuple[float, float]:
+    """`shown_at`, sought from (column, line) on."""
     for _ in range(_MOST_STEPS):
         left, above = column, line
         time = numbers[5] + numbers[4] * row_of(column, line, numbers, rows)
@@ -168,4 +174,23 @@ def _shown(pixels: FloatArray, depths: FloatArray, numbers: FloatArray, rows: Fl
     result = np.empty((len(pixels), 2))
     for i in range(len(pixels)):
         result[i] = shown_at(pixels[i, 0], pixels[i, 1], depths[i], numbers, rows)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _shown_beside(
+    pixels: FloatArray, directions: FloatArray, depths: FloatArray, numbers: FloatArray, rows: FloatArray
+) -> FloatArray:
+    """(1 + D, N, 2): see `RolledImage.shown_beside`; directions (D, N, 2)."""
+    result = np.empty((1 + len(directions), len(pixels), 2))
+    for i in range(len(pixels)):
+        u, v = pixels[i]
+        column, line = shown_at(u, v, depths[i], numbers, rows)
+        result[0, i, 0], result[0, i, 1] = column, line
+        for k in range(len(directions)):
+            across, down = directions[k, i]
+            ahead = _shown_near(column + across, line + down, u + across, v + down, depths[i], numbers, rows)
+            behind = _shown_near(column - across, line - down, u - across, v - down, depths[i], numbers, rows)
+            result[1 + k, i, 0] = 0.5 * (ahead[0] - behind[0])
+            result[1 + k, i, 1] = 0.5 * (ahead[1] - behind[1])
     return result
