@@ -43,7 +43,7 @@ def view_overlap(
     return np.asarray(seen.mean(axis=1), np.float64)
 
 
-def shown_beside(points: FloatArray, before: tuple[FloatArray, Camera], after: tuple[FloatArray, Camera]) -> bool:
+def is_shown_beside(points: FloatArray, before: tuple[FloatArray, Camera], after: tuple[FloatArray, Camera]) -> bool:
     """Whether the views before and after one, of a rolling shutter, both show enough of the (K, 3) points of that one.
 
     Keyframes of a rolling shutter are denser in time than their overlap asks for: poses between them tell how the

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.view_overlap import in_image, shown_beside
+from pipeprog_camera.view_overlap import in_image, is_shown_beside
 
 # Points of the cloud that tell it: of the 500 or more in an image, to 0.02.
 SAMPLE = 4000
@@ -30,6 +30,6 @@ def without_overlapping(views: Sequence[tuple[FloatArray, Camera]], points: NDAr
     kept: list[int] = []
     for number, seen in enumerate(in_image(some, views)):
         is_between = bool(kept) and number + 1 < len(views)
-        if not is_between or not shown_beside(some[seen], views[kept[-1]], views[number + 1]):
+        if not is_between or not is_shown_beside(some[seen], views[kept[-1]], views[number + 1]):
             kept.append(number)
     return kept

@@ -9,7 +9,7 @@ import pytest
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
-from pipeprog_camera.view_overlap import FOR_THE_MOTION, in_image, shown_beside, view_overlap
+from pipeprog_camera.view_overlap import FOR_THE_MOTION, in_image, is_shown_beside, view_overlap
 
 CAMERA = Camera(240, 160, 220.0, 220.0, 119.5, 79.5)
 STEP = 16  # px between two views of the wall at a distance of 1 m
@@ -42,6 +42,6 @@ def test_a_view_is_between_others_that_both_show_enough_of_it(aside: int) -> Non
     points = WALL[in_image(WALL, [(pose(4), CAMERA)])[0]]
     around = (pose(4 - aside), CAMERA), (pose(4 + aside), CAMERA)
     share = 1 - 2 * aside * STEP / CAMERA.width  # each lacks another side of it
-    assert shown_beside(points, *around) == (share > FOR_THE_MOTION)
-    assert shown_beside(points, around[0], around[0]) == (share + aside * STEP / CAMERA.width > FOR_THE_MOTION)
-    assert not shown_beside(points[:0], *around)
+    assert is_shown_beside(points, *around) == (share > FOR_THE_MOTION)
+    assert is_shown_beside(points, around[0], around[0]) == (share + aside * STEP / CAMERA.width > FOR_THE_MOTION)
+    assert not is_shown_beside(points[:0], *around)

@@ -18,7 +18,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
-from pipeprog_camera.view_overlap import in_image, sample, shown_beside, view_overlap
+from pipeprog_camera.view_overlap import in_image, is_shown_beside, sample, view_overlap
 from pipeprog_sfm.config import FusionConfig, StereoConfig
 from pipeprog_sfm.dense.depth_fusion import FusedCloud, Fusion
 from pipeprog_sfm.dense.stereo import (
@@ -212,7 +212,7 @@ class DenseMapper:
         after = min((each for each in keyframes.poses if each > stamp), default=None)
         if not keyframes.motions or before is None or after is None:
             return None
-        return before if shown_beside(points, keyframes.view(before), keyframes.view(after)) else None
+        return before if is_shown_beside(points, keyframes.view(before), keyframes.view(after)) else None
 
     def _consider(self, stamp: int, keyframes: Registered) -> None:
         points = keyframes.in_front(stamp)
