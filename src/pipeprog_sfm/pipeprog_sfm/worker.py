@@ -145,8 +145,8 @@ def serve(
     """Processes commands from `connection` until it closes; those that a predecessor has answered come first.
 
     Without `intermediate`, the only map is the one that Finish asks for, in the frame of the reference if there is one.
-    With `ahead`, images that have come are prepared while the ones before are worked off. Should the process die of one
-    of them, it is not told of which.
+    With `ahead`, images that have come are prepared while the ones before are worked off; with intermediate maps the
+    other cores make these. Should the process die of one of the images, it is not told of which.
     """
     warm_up(config)
     reconstruction = Reconstruction(config, board_file, reference=reference)
@@ -155,7 +155,7 @@ def serve(
         if isinstance(command, AddKeyframe):
             reconstruction.expect(command.stamp, command.encoded, command.camera)
 
-    channel: Channel = Inbox(connection, expect) if ahead else connection
+    channel: Channel = Inbox(connection, expect) if ahead and not intermediate else connection
     work(channel, reconstruction, config.map_interval if intermediate else None, answered)
 
 

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+from multiprocessing import Pipe
 from typing import Any, cast
 
 import pytest
 
 from pipeprog_camera.camera import Camera
 from pipeprog_sfm import worker
+from pipeprog_sfm.boards.board_file import BoardFile
+from pipeprog_sfm.config import SfmConfig
+from pipeprog_sfm.inbox import Inbox
 from pipeprog_sfm.reconstruction import NotMetricError
 from pipeprog_sfm.worker import ANSWER_SECONDS, HOLD_SECONDS, IDLE_SECONDS, POLL_SECONDS
 
@@ -123,6 +127,21 @@ def events(
     with pytest.raises(EOFError):
         worker.work(script, cast(Any, Prompt(metric_after, looks)), map_interval, answered, lambda: script.now)
     return script.events
+
+
+@pytest.mark.parametrize(
+    ("ahead", "intermediate", "expected"), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_replay_alone_is_read_ahead(
+    ahead: bool, intermediate: bool, expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Live, the other cores make depth maps and find pipes."""
+    channels: list[object] = []
+    monkeypatch.setattr(worker, "warm_up", lambda config: None)
+    monkeypatch.setattr(worker, "work", lambda channel, *others: channels.append(channel))
+    connection = Pipe()[1]
+    worker.serve(connection, SfmConfig(), BoardFile(), intermediate, None, ahead, ())
+    assert isinstance(channels[0], Inbox) == expected
 
 
 def test_no_map_follows_the_last_one() -> None:
