@@ -208,9 +208,11 @@ class DenseMapper:
 
     def _beside(self, stamp: int, points: FloatArray, keyframes: Registered) -> int | None:
         """The keyframe before one of a rolling shutter that came for the motion; None for another, or a global one."""
+        if not keyframes.motions:
+            return None
         before = max((each for each in keyframes.poses if each < stamp and each not in self._between), default=None)
         after = min((each for each in keyframes.poses if each > stamp), default=None)
-        if not keyframes.motions or before is None or after is None:
+        if before is None or after is None:
             return None
         return before if is_shown_beside(points, keyframes.view(before), keyframes.view(after)) else None
 
