@@ -223,17 +223,20 @@ class DenseMapper:
             return
         before = self._beside(stamp, points, keyframes)
         if before is not None:
-            self._covered[stamp] = before
             self._between.add(stamp)
-            self._unsettled.append(stamp)
+            self._cover(stamp, before)
             return
         mapped = [other for other in self._depths if other in keyframes]
         seen = view_overlap(sample(points), keyframes.poses[stamp], [keyframes.view(other) for other in mapped])
         if len(seen) and seen.max() > self._overlap:
-            self._covered[stamp] = mapped[int(seen.argmax())]
-            self._unsettled.append(stamp)
+            self._cover(stamp, mapped[int(seen.argmax())])
             return
         self._start(stamp, keyframes, points)
+
+    def _cover(self, stamp: int, other: int) -> None:
+        """Leaves what a keyframe shows to another one, but for its margins."""
+        self._covered[stamp] = other
+        self._unsettled.append(stamp)
 
     def _settle(self, keyframes: Registered, newest: int, complete: bool) -> None:
         """Starts depth maps of covered keyframes that show, at a margin, what too few others show.
