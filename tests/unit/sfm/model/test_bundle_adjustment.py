@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import VIEWS, bundle
 
-from pipeprog_sfm.model.bundle_adjustment import Bundle, adjust, rotation_from_vector
+from pipeprog_sfm.model import bundle_adjustment
+from pipeprog_sfm.model.bundle_adjustment import (
+    Bundle,
+    adjust,
+    eliminate_points,
+    pairs_of_views,
+    rotation_from_vector,
+)
 
 
 def disturbed(truth: Bundle, free: NDArray[np.bool_]) -> Bundle:
@@ -46,6 +53,56 @@ def test_gross_errors_hardly_move_the_result() -> None:
     result = disturbed(truth, free)
     # 150 points of 0.3 px each at 2 m hold a camera to some 0.1 mm; the outliers of 50 px would move it by 10 mm.
     assert np.abs(result.translation - truth.translation).max() < 0.002
+
+
+def test_residuals_are_those_of_the_pinhole_camera() -> None:
+    noisy = bundle(noise=0.3)
+    for point, (first, last) in enumerate(zip(noisy.start[:-1], noisy.start[1:], strict=True)):
+        for k in range(first, last):
+            c = noisy.view[k]
+            x, y, z = noisy.rotation[c] @ noisy.points[point] + noisy.translation[c]
+            expected = noisy.focal[c] * ([x / z, y / z] - noisy.rays[k])
+            np.testing.assert_allclose(noisy.residuals()[k], expected, atol=1e-9)
+
+
+def test_the_cost_is_the_sum_of_the_logarithms() -> None:
+    """Also where the product of all would be beyond what a double holds, and of a point behind all cameras."""
+    wrong = bundle(noise=0.3, outliers=0.5)
+    wrong.rays[::3] += 1e6
+    square = (wrong.residuals() ** 2).sum(axis=1)
+    assert np.log10(1.0 + square / 0.25).sum() > 308
+    expected = 0.5 * 0.25 * np.log1p(square / 0.25).sum()
+    assert bundle_adjustment._cost(*wrong.arrays(), 0.5) == pytest.approx(expected, rel=1e-12)
+    behind = replace(wrong, points=wrong.points - [0.0, 0.0, 1e3])
+    assert bundle_adjustment._cost(*behind.arrays(), 0.5) == pytest.approx(0.5 * 0.25 * 20.0 * len(wrong.view))
+
+
+def test_points_are_eliminated_by_the_schur_complement() -> None:
+    noisy = bundle(noise=0.3)
+    free = np.arange(VIEWS) != 1
+    index = np.where(free, np.cumsum(free) - 1, -1)
+    count, damping = VIEWS - 1, 0.1
+    pairs, row, column = pairs_of_views(noisy.start, noisy.view, index, count)
+    u, gc, v, gp, w = bundle_adjustment._linearise(*noisy.arrays(), index, count, 1.0)
+    blocks, gradient, inverse = eliminate_points(
+        u, gc, v, gp, w, noisy.start, noisy.view, index, pairs, len(row), damping
+    )
+    whole, expected = np.zeros((count, 6, count, 6)), gc.copy()
+    for c in range(count):
+        whole[c, :, c] = u[c] + damping * np.diag(np.diag(u[c]))
+    for point, (first, last) in enumerate(zip(noisy.start[:-1], noisy.start[1:], strict=True)):
+        np.testing.assert_allclose(
+            inverse[point], np.linalg.inv(v[point] + damping * np.diag(np.diag(v[point]))), rtol=1e-6
+        )
+        seeing = [k for k in range(first, last) if free[noisy.view[k]]]
+        for k in seeing:
+            expected[index[noisy.view[k]]] -= w[k] @ inverse[point] @ gp[point]
+            for m in seeing:
+                whole[index[noisy.view[k]], :, index[noisy.view[m]]] -= w[k] @ inverse[point] @ w[m].T
+    scale = np.abs(whole).max()
+    for block, a, b in zip(blocks, row, column, strict=True):
+        np.testing.assert_allclose(block, whole[a, :, b], atol=1e-9 * scale)
+    np.testing.assert_allclose(gradient, expected, atol=1e-9 * np.abs(gc).max())
 
 
 @settings(max_examples=30, deadline=None)
