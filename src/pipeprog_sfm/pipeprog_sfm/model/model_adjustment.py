@@ -104,10 +104,12 @@ def _adjust(
     ids, start, features = model.observations(chosen)
     if not len(ids):
         return None
-    used, view = np.unique(model.view_of[features], return_inverse=True)
+    used = np.flatnonzero(np.bincount(model.view_of[features]))
+    number = np.zeros(len(model), np.int64)  # of each view among those used
+    number[used] = np.arange(len(used))
     bundle = Bundle(
         model.rotation[used], model.translation[used], model.points[ids],
-        start, view.astype(np.int64), model.rays[features], model.focal[used],
+        start, number[model.view_of[features]], model.rays[features], model.focal[used],
     )  # fmt: skip
     after = _noise(bundle.errors())
     while True:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray, IntArray
-from pipeprog_sfm.model.tracks import NONE, covisible, digests, extend, filter_tracks, triangulate
+from pipeprog_sfm.model.tracks import NONE, by_point, covisible, digests, extend, filter_tracks, triangulate
 
 MAX_ERROR = 3.0  # px: the noise of SIFT is below 1 px, wrong matches are uniform in the search range
 INITIAL_NOISE = 1.0  # px, of a coordinate, before it can be estimated: more than SIFT has
@@ -160,13 +160,8 @@ class SparseModel:
 
         Returns the ids of the points that are seen (P,), the bounds (P + 1,) and the flat features (K,).
         """
-        flags = np.append(points, False)  # NONE indexes the last one
-        features = np.flatnonzero(flags[self.point_of])
-        owner = self.point_of[features]
-        order = np.argsort(owner, kind="stable")
-        features, owner = features[order], owner[order]
-        ids, start = np.unique(owner, return_index=True)
-        return ids, np.append(start, len(features)), features
+        ids, start, features = by_point(self.point_of, points)
+        return ids, start, features
 
     def digests(self) -> NDArray[np.uint64]:
         """(V,) hash of each view's points: another number when they have changed."""

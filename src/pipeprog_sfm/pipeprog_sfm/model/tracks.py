@@ -24,6 +24,25 @@ def _error(rotation, translation, focal, x, y, z, u, v):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
+def by_point(point_of, chosen):  # type: ignore[no-untyped-def]  # compiled
+    """Ids of the chosen points (mask over all) that features see, bounds of the features of each, and all of these."""
+    count = np.zeros(len(chosen), np.int64)
+    for feature in range(len(point_of)):
+        if point_of[feature] != NONE and chosen[point_of[feature]]:
+            count[point_of[feature]] += 1
+    ids = np.flatnonzero(count)
+    end = np.append(0, np.cumsum(count))  # until a point has its features: where the next one goes
+    start = np.append(end[ids], end[-1])
+    features = np.empty(end[-1], np.int64)
+    for feature in range(len(point_of)):
+        point = point_of[feature]
+        if point != NONE and chosen[point]:
+            features[end[point]] = feature
+            end[point] += 1
+    return ids, start, features
+
+
+@njit(cache=True, nogil=True)
 def digests(point_of, offsets):  # type: ignore[no-untyped-def]  # compiled
     """FNV-1a over the points of each view, a word at a time."""
     hashes = np.full(len(offsets) - 1, 0xCBF29CE484222325, np.uint64)

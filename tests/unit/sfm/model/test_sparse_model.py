@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scenes import FOCAL, POINTS, VIEWS, bundle, sparse_model
 
 from pipeprog_sfm.model.bundle_adjustment import rotation_from_vector
+from pipeprog_sfm.model.tracks import by_point
 from pipeprog_sfm.sparse.registration import epipolar_errors
 
 
@@ -17,6 +20,18 @@ def test_links_become_one_track_a_point() -> None:
     assert len(ids) == POINTS
     assert (np.diff(start) == VIEWS).all()
     assert np.sort(built.points[ids], axis=0) == pytest.approx(np.sort(bundle(0.0).points, axis=0), abs=1e-6)
+
+
+@given(st.lists(st.integers(-1, 6), max_size=40), st.lists(st.booleans(), min_size=7, max_size=7))
+def test_features_come_point_by_point(point_of: list[int], chosen: list[bool]) -> None:
+    ids, start, features = by_point(np.array(point_of, np.int64), np.array(chosen))
+    expected = [point for point in range(7) if chosen[point] and point in point_of]
+    assert ids.tolist() == expected
+    assert len(start) == len(expected) + 1
+    for number, point in enumerate(expected):
+        own = [feature for feature, other in enumerate(point_of) if other == point]
+        assert features[start[number] : start[number + 1]].tolist() == own
+    assert start[-1] == len(features)
 
 
 def test_a_moved_view_contradicts_its_matches() -> None:
