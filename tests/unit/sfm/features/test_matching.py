@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeprog_sfm.features import matching
 from pipeprog_sfm.features.matching import match, match_guided
 from pipeprog_sfm.features.sift import root_sift
 
@@ -32,6 +33,11 @@ def test_match_refuses_unrelated_and_ambiguous_features() -> None:
     looks = descriptors(0)
     assert len(match(root_sift(looks), root_sift(descriptors(9)))) == 0
     assert len(match(noisy(looks, 2), root_sift(np.concatenate([looks, looks])))) == 0
+
+
+def test_the_largest_of_each_column_is_the_first_one() -> None:
+    values = np.random.default_rng(0).integers(0, 5, (30, 200)).astype(np.float32)  # many are as large
+    np.testing.assert_array_equal(matching._largest_of_columns(values), values.argmax(axis=0))
 
 
 def test_match_of_nothing_is_empty() -> None:
