@@ -133,33 +133,40 @@ def _changed(motion: RowMotion, by: FloatArray) -> RowMotion:
 def _normal_equations(inside, rays, times, rates, focal, noise, blocks):  # type: ignore[no-untyped-def]  # compiled
     """(6 blocks, 6 blocks) sums of the weighted rows' products, and (6 blocks,) of these with the residuals.
 
-    A row is that of a pixel of a point (K, 3), by pose, velocity and acceleration (turn and shift each).
+    A row is that of a pixel of a point (K, 3), by pose, velocity and acceleration (turn and shift each). The columns
+    are those of the pose times 1, t and t^2 / 2, and so sums of the pose's alone, times powers of t, tell all.
     """
-    count = 6 * blocks
-    sums, pull = np.zeros((count, count)), np.zeros(count)
-    across, down = np.empty(count), np.empty(count)
+    products = np.zeros((2 * blocks - 1, 36))  # of the pose's columns, times t to the power of 0, 1, ...
+    pulls = np.zeros((blocks, 6))
+    across, down, product = np.empty(6), np.empty(6), np.empty(36)
     for k in range(len(inside)):
         x, y, z = inside[k]
         u, v, time = x / z, y / z, times[k]
         ray_x, ray_y = unrolled_ray(rays[k, 0], rays[k, 1], time, z, rates)
         right, below = (ray_x - u) * focal[0], (ray_y - v) * focal[1]
         weight = 1.0 / (1.0 + (right * right + below * below) / (RAYLEIGH_MEDIAN * noise) ** 2) / noise**2
-        by_turn, by_shift = (-u * y, z + u * x, -y), (1.0, 0.0, -u)
-        down_turn, down_shift = (-z - v * y, v * x, x), (0.0, 1.0, -v)
+        fx, fy = focal[0] / z, focal[1] / z
+        across[0], across[1], across[2] = -fx * u * y, fx * (z + u * x), -fx * y
+        across[3], across[4], across[5] = fx, 0.0, -fx * u
+        down[0], down[1], down[2] = -fy * (z + v * y), fy * v * x, fy * x
+        down[3], down[4], down[5] = 0.0, fy, -fy * v
+        for i in range(6):
+            for j in range(6):
+                product[6 * i + j] = weight * (across[i] * across[j] + down[i] * down[j])
         power = 1.0
-        for block in range(blocks):
-            for n in range(3):
-                across[6 * block + n] = power * focal[0] / z * by_turn[n]
-                across[6 * block + 3 + n] = power * focal[0] / z * by_shift[n]
-                down[6 * block + n] = power * focal[1] / z * down_turn[n]
-                down[6 * block + 3 + n] = power * focal[1] / z * down_shift[n]
-            power *= time / (block + 1)
-        for i in range(count):
-            first, second = weight * across[i], weight * down[i]
-            pull[i] += first * right + second * below
-            for j in range(i + 1):
-                sums[i, j] += first * across[j] + second * down[j]
-    for i in range(count):
-        for j in range(i):
-            sums[j, i] = sums[i, j]
+        for n in range(2 * blocks - 1):
+            for i in range(36):
+                products[n, i] += power * product[i]
+            if n < blocks:
+                for i in range(6):
+                    pulls[n, i] += power * weight * (across[i] * right + down[i] * below)
+            power *= time
+    sums, pull = np.empty((6 * blocks, 6 * blocks)), np.empty(6 * blocks)
+    for first in range(blocks):
+        scale = 0.5 if first == 2 else 1.0
+        pull[6 * first : 6 * first + 6] = scale * pulls[first]
+        for second in range(blocks):
+            both = 0.5 * scale if second == 2 else scale
+            block = both * products[first + second].reshape(6, 6)
+            sums[6 * first : 6 * first + 6, 6 * second : 6 * second + 6] = block
     return sums, pull
