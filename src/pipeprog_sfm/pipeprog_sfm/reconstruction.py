@@ -186,7 +186,6 @@ class Reconstruction:
 
     def finish(self) -> MetricMap:
         """Registers what still can be, adjusts everything, and makes the final map; raises NotMetricError."""
-        self._dense.start_waiting()  # beside what comes here
         self._mapper.finish()
         if self._camera.refines:
             self._settle_camera(final=True)

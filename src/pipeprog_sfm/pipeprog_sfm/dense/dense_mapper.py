@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dense cloud of a stream of keyframes: which of them get a depth map; made and fused in a thread of its own."""
+"""The dense cloud of a stream of keyframes: which of them get a depth map; made and fused in threads of their own."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neig
 # told that they are missing, and without them its velocity is off by 10 % and 0.1 rad/s, 1 px at the border of an image
 # of 30 ms; with them by a tenth of that.
 FILLED = 3_000_000_000
-SUBMITTED = 2  # depth maps queued at a time: a fusion that is requested waits for no more than these
+# Depth maps made at a time: each takes one core, and 130 MB at 720p.
+THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 4)
 PICTURES = 12  # of keyframes at working resolution, 15 MB each at 720p: neighbours are mostly the last few
-NICENESS = 5  # of the thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
+NICENESS = 5  # of each thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
 # A keyframe of which the newest one sees less than this share is left behind: no nearer one comes any more.
 LEFT_BEHIND = 0.5
@@ -110,12 +111,12 @@ class _Depth:
 
 
 class DenseMapper:
-    """Depth maps and their fusion, in one thread of low priority beside the mapper.
+    """Depth maps and their fusion, in threads of low priority beside the mapper.
 
     A keyframe gets a depth map unless another one shows nearly the same, and in the end enough of them what it shows at
     its margins: what is held grows with the map, not with the time spent in it. So it is, with a rolling shutter, with
-    keyframes that came for the motion: those beside them show what they show. Depth maps are made in the order of the
-    calls with the poses of the call, so that the result does not depend on timing.
+    keyframes that came for the motion: those beside them show what they show. Depth maps are made with the poses of
+    the call and fused in the order of the poses, so that the result does not depend on timing.
     """
 
     def __init__(self, stereo: StereoConfig, fusion: FusionConfig) -> None:
@@ -125,15 +126,14 @@ class DenseMapper:
         self._overlap = 1.0 - 1.0 / (2 * fusion.min_views)
         self._picture = lru_cache(maxsize=PICTURES)(_picture)
         self._depths: dict[int, Future[_Depth]] = {}
-        self._waiting: deque[Callable[[], None]] = deque()
-        self._submitted: deque[Future[None]] = deque()
         self._covered: dict[int, int] = {}  # keyframes without a depth map, and the one that shows the same
         self._between: set[int] = set()  # of these, those that came for the motion
         self._unsettled: deque[int] = deque()  # of these, those whose surroundings have not all got theirs
         self._shift = 0.0  # px, at most: by which the camera has changed since the first keyframe
         self._started_at: dict[int, float] = {}  # that shift when a depth map was started
         self._refused: dict[int, int] = {}  # keyframes without neighbours to match, and the size of the map then
-        self._thread = ThreadPoolExecutor(max_workers=1, initializer=_be_nice)
+        self._stereo = ThreadPoolExecutor(THREADS, initializer=_be_nice)
+        self._fusing = ThreadPoolExecutor(1, initializer=_be_nice)
         self._fusion = Fusion(fusion)  # from here on the thread's own
         self._fused: dict[int, FloatArray] = {}
 
@@ -155,11 +155,6 @@ class DenseMapper:
                 self._consider(stamp, keyframes)
         if ready:
             self._settle(keyframes, stamps[: len(ready) + LOOKAHEAD][-1], complete)
-        self._submit(all_of_them=complete)
-
-    def start_waiting(self) -> None:
-        """Has the thread make all depth maps that wait for their turn, however many these are."""
-        self._submit(all_of_them=True)
 
     def retire(self, stamps: Collection[int]) -> None:
         """Gives up depth maps; what they showed is left to others again."""
@@ -183,7 +178,7 @@ class DenseMapper:
         outdated = [stamp for stamp, start in self._started_at.items() if self._shift - start > OUTDATED]
         if outdated:
             self.retire(outdated)
-            self._thread.submit(self._start_anew)
+            self._fusing.submit(self._start_anew)
 
     def fuse(
         self,
@@ -198,13 +193,12 @@ class DenseMapper:
         Of all depth maps if complete, else of those that are there. They are added to the last cloud, unless it is to
         be made anew, the poses have moved by more than a voxel, or much in it is of depth maps that were given up.
         """
-        self._submit(all_of_them=complete)
         maps = {}
         for stamp, pose in camera_from_map.items():
             future = self._depths.get(stamp)
             if future is not None and (complete or future.done()):
                 maps[stamp] = (future, pose)
-        return self._thread.submit(self._fuse, maps, dict(camera_from_model), scale, anew)
+        return self._fusing.submit(self._fuse, maps, dict(camera_from_model), scale, anew)
 
     def _beside(self, stamp: int, points: FloatArray, keyframes: Registered) -> int | None:
         """The keyframe before one of a rolling shutter that came for the motion; None for another, or a global one."""
@@ -276,24 +270,8 @@ class DenseMapper:
         views = [
             _Source(other, images[other], poses[other], _motion(keyframes.motions, other)) for other in [stamp, *pairs]
         ]
-        future: Future[_Depth] = Future()
-        self._depths[stamp], self._started_at[stamp] = future, self._shift
-
-        def make() -> None:
-            if not future.set_running_or_notify_cancel():
-                return
-            try:
-                future.set_result(self._depth(views, depth_range))
-            except BaseException as error:
-                future.set_exception(error)
-
-        self._waiting.append(make)
-
-    def _submit(self, all_of_them: bool) -> None:
-        while self._submitted and self._submitted[0].done():
-            self._submitted.popleft()
-        while self._waiting and (all_of_them or len(self._submitted) < SUBMITTED):
-            self._submitted.append(self._thread.submit(self._waiting.popleft()))
+        self._depths[stamp] = self._stereo.submit(self._depth, views, depth_range)
+        self._started_at[stamp] = self._shift
 
     def _depth(self, views: list[_Source], depth_range: tuple[float, float]) -> _Depth:
         width = self._stereo_config.width

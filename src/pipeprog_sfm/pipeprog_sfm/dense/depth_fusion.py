@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
@@ -245,7 +245,7 @@ def _rehash(table, keys, size):  # type: ignore[no-untyped-def]
         table[_slot(table, keys, keys[index])] = index
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _confirm(depth, others, matrix, other_matrices, others_from_view, agreement, agreeing_min):  # type: ignore[no-untyped-def]
     """Depth averaged with the views that agree, normals (camera frame, towards it), and how many agree (0: dropped).
 
@@ -257,7 +257,7 @@ def _confirm(depth, others, matrix, other_matrices, others_from_view, agreement,
     fused = np.zeros((height, width), np.float32)
     normals = np.zeros((height, width, 3), np.float32)
     agreeing = np.zeros((height, width), np.uint8)
-    for v in prange(height):
+    for v in range(height):
         for u in range(width):
             z = depth[v, u]
             if not z > 0.0:

@@ -8,7 +8,7 @@ best match is Gauss-Newton on the zero-mean differences, as in Furukawa and Ponc
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_sfm.dense.row_mapping import RowMapping, at_other_row, at_row
@@ -74,7 +74,7 @@ def fours(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
     return wide
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
     """Inverse depth drawn to the plane around it as far as its sigma demands, and its (h, w, 2) derivatives.
 
@@ -84,7 +84,7 @@ def _smooth(inverse_depth, sigma, stride):  # type: ignore[no-untyped-def]
     height, width = inverse_depth.shape
     smooth = inverse_depth.copy()
     slant = np.zeros((height, width, 2), np.float32)
-    for v in prange(height):
+    for v in range(height):
         sums, scratch = np.zeros((10, width), np.float32), np.empty((4, width), np.float32)
         for i in range(max(0, v - PLANE_RADIUS), min(height, v + PLANE_RADIUS + 1)):
             for shift in range(-PLANE_RADIUS, PLANE_RADIUS + 1):
@@ -140,7 +140,7 @@ def _add_times(values, factor, total):  # type: ignore[no-untyped-def]
         total[u] += values[u] * factor
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, better_half, distance, stride, rows):  # type: ignore[no-untyped-def]
     """Takes over the plane of a grid neighbour where it matches better, then one Gauss-Newton step of the depth.
 
@@ -150,8 +150,7 @@ def _round(inverse_depth, slant, image, neighbours, homographies, epipoles, bett
     out = np.full((height, width), np.nan, np.float32)
     correlations = np.zeros((height, width), np.float32)
     sigmas = np.full((height, width), np.inf, np.float32)
-    for index in prange(height):
-        row = np.int64(index)  # prange counts unsigned
+    for row in range(height):
         v = row * stride
         if v < RADIUS or v >= image.shape[0] - RADIUS:
             continue

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_sfm.dense.row_mapping import RowMapping, at_row
@@ -122,13 +122,13 @@ def _about(
     return low.astype(np.int32)[rows[:, None], columns], high.astype(np.int32)[rows[:, None], columns]
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def census(image, stride):  # type: ignore[no-untyped-def]
     """Bit string of a pixel: which pixels around it, `stride` apart, are darker. 0 at the border: unknown."""
     height, width = image.shape
     margin = RADIUS * stride
     out = np.zeros((height, width), np.uint32)
-    for v in prange(margin, height - margin):
+    for v in range(margin, height - margin):
         for u in range(margin, width - margin):
             bits = 1  # a leading one tells the code of a flat patch from unknown
             for i in range(-RADIUS, RADIUS + 1):
@@ -139,7 +139,7 @@ def census(image, stride):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _cost_volume(census, others, homographies, epipoles, tried, most, rows):  # type: ignore[no-untyped-def]
     """(offsets[-1],) uint8: Hamming distances of the two best views, summed: occlusion on one side does not matter.
 
@@ -152,8 +152,7 @@ def _cost_volume(census, others, homographies, epipoles, tried, most, rows):  # 
     codes = others.reshape(number, other_height * other_width)
     costs = np.empty(tried.offsets[-1], np.uint8)
     step = tried.step
-    for row in prange(height):
-        v = np.int64(row)  # prange counts unsigned
+    for v in range(height):
         room = np.empty(most, np.int32), np.empty(most, np.uint32), np.empty(most, np.int32), np.empty(most, np.int32)
         turned, moved = np.empty((2, 3), np.float32)
         for u in range(width):
@@ -265,7 +264,7 @@ def _compare(code, seen, first, second):  # type: ignore[no-untyped-def]
         first[d] = min(least, cost)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _aggregate(costs, tried, penalty_small, penalty_large):  # type: ignore[no-untyped-def]
     """(2, offsets[-1]) uint16: path costs from above (left, upper left, up, upper right) and, mirrored, from below."""
     starts, offsets = tried.starts, tried.offsets
@@ -274,7 +273,7 @@ def _aggregate(costs, tried, penalty_small, penalty_large):  # type: ignore[no-u
     longest = 0  # row of hypotheses
     for v in range(height):
         longest = max(longest, offsets[(v + 1) * width] - offsets[v * width])
-    for half in prange(2):
+    for half in range(2):
         # Path costs of two rows, four directions each, and their least ones; the rows take turns.
         paths = np.full(8 * longest, _BARRED, np.uint16)
         leasts = np.zeros((2, 4, width), np.uint16)
@@ -341,13 +340,12 @@ def _extend(  # type: ignore[no-untyped-def]
     return lowest
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _best(sums, tried, count):  # type: ignore[no-untyped-def]
     """(h, w) float32 index of the least sum, refined between its two neighbours; NaN at either end of the range."""
     height, width = tried.starts.shape
     out = np.full((height, width), np.nan, np.float32)
-    for row in prange(height):
-        v = np.int64(row)  # prange counts unsigned
+    for v in range(height):
         for u in range(width):
             begin, end = tried.offsets[v * width + u], tried.offsets[v * width + u + 1] - APART
             above, below = sums[0, begin:end], sums[1, begin:end]

@@ -19,7 +19,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from pipeprog_camera.arrays import FloatArray
@@ -176,13 +176,13 @@ def depth_at_the_stamp(
     return _at_the_stamp(depth, typical, image.numbers * coarser, image.rows / stride)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _at_the_stamp(depth, typical, numbers, rows):  # type: ignore[no-untyped-def]
     """See `depth_at_the_stamp`; `typical`: depth where the search starts if nothing is known."""
     height, width = depth.shape
     result = np.full((height, width), np.nan, np.float32)
     places = np.zeros((height, width, 2), np.float32)
-    for v in prange(height):
+    for v in range(height):
         there = typical
         right, down = 0.0, 0.0  # from a pixel to where the image shows it: little changes from one to the next
         for u in range(width):
