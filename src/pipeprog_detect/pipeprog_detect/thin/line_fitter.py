@@ -23,6 +23,7 @@ from pipeprog_detect.thin.axis_sweep import Proposal
 from pipeprog_detect.thin.depth_from_cloud import DEPTH_REACH, at_cloud_depth, mean_centre
 from pipeprog_detect.thin.line_triangulation import DEPTH_SIGMA
 from pipeprog_detect.thin.parallel_directions import LEAST_PARALLEL, NEARLY_PARALLEL, PARALLEL_SIGMA
+from pipeprog_detect.threads import mapped
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, MANUFACTURE, REACH
 
@@ -91,14 +92,14 @@ class LineFitter:
             Start(each, each.radius, True, sigma, PARALLEL_SIGMA, radius_fixed=True, radius_error=error)
             for each, sigma in rough
         ]
-        located = [self._refined(each, known) for each in starts]
+        located = mapped(lambda each: self._refined(each, known), starts)
         # The known direction is evidence once: the fit has drawn the axis from it as far as the views did.
         again = [
             turned(replace(fit.cylinder, radius=start.radius), start.axis, self.views)
             for fit in located
             if fit is not None
         ]
-        fits = [self._parallel(each, LINE_DEPTH_SIGMA, known) for each in again]
+        fits = mapped(lambda each: self._parallel(each, LINE_DEPTH_SIGMA, known), again)
         seen = [fit for fit in fits if fit is not None and _keeps_depth(fit.cylinder, rough, centre)]
         return max(seen, key=lambda fit: fit.log_odds, default=None)
 
