@@ -22,7 +22,7 @@ PACKAGES := $(wildcard src/*/package.xml src/*/setup.py src/*/setup.cfg src/*/CM
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | while IFS="$$(printf '\t')" read -r name what; do printf '  make %-12s %s\n' "$$name" "$$what"; done
 
-setup: $(VENV)/.workspace $(if $(VIEW),$(VENV)/.view) $(if $(FLEET),$(VENV)/.fleet) $(if $(EXCHANGE),$(VENV)/.exchange) $(if $(VIDEO),$(VENV)/.video) ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter; VIEW=1 adds Open3D for pipeprog view, FLEET=1 Dask for pipeprog fleet, EXCHANGE=1 IFC and DXF, VIDEO=1 video in recordings)
+setup: $(VENV)/.kernels $(if $(VIEW),$(VENV)/.view) $(if $(FLEET),$(VENV)/.fleet) $(if $(EXCHANGE),$(VENV)/.exchange) $(if $(VIDEO),$(VENV)/.video) ## environment with ROS 2 and the workspace, in .venv (PYTHON=python3.12 chooses the interpreter; VIEW=1 adds Open3D for pipeprog view, FLEET=1 Dask for pipeprog fleet, EXCHANGE=1 IFC and DXF, VIDEO=1 video in recordings)
 
 $(VENV)/.home:
 	@$(SHELL) setup/check.sh "$(PYTHON)"
@@ -58,6 +58,12 @@ $(VENV)/.video: $(VENV)/.packages requirements-video.txt
 
 $(VENV)/.workspace: $(VENV)/.packages setup/build.sh setup/pipeprog_start.py $(wildcard setup/*_msgs/* setup/*_msgs/msg/* setup/*_msgs/action/*) $(INTERFACES) $(PACKAGES)
 	@$(SHELL) setup/build.sh $(VENV)
+	@touch $@
+
+# What is changed later is compiled when it is first called.
+$(VENV)/.kernels: $(VENV)/.workspace setup/compile.py
+	@echo "Compiling what the surveys compute with (a minute and a half) ..."
+	@$(BIN)/python setup/compile.py
 	@touch $@
 
 demo: setup ## the recording in bags/ through the node graph, and its report

@@ -20,7 +20,6 @@ from pipeprog_camera.errors import InputError
 from pipeprog_camera.limits import MAX_NAME
 from pipeprog_camera.rig import unique_stamp
 from pipeprog_frames.acknowledgements import MAX_AHEAD, Answer, Ledger
-from pipeprog_frames.compiled_ahead import compile_ahead
 from pipeprog_frames.config import FramesConfig
 from pipeprog_frames.frame_decision import DAMAGED, FAULTS, UNCALIBRATED, Decision
 from pipeprog_frames.incoming.arrival import MAX_QUEUE, Arrival, ArrivalQueue
@@ -30,6 +29,7 @@ from pipeprog_frames.overlap_feedback import OverlapReport
 from pipeprog_frames.policy.stream import UNLOADED_LAG
 from pipeprog_frames.rig_selection import ONE, RigSelection
 from pipeprog_frames.selection import Selected
+from pipeprog_frames.warm_up import warm_up
 from pipeprog_msgs.msg import FrameDecision, ImageOverlapArray, KeyframesRetired
 from pipeprog_node import messages, qos
 from pipeprog_node.diagnostics import Diagnostics
@@ -176,7 +176,7 @@ class FramesNode(Node):
             raise InputError("policy = network takes a whole recording: use it with `pipeprog replay`, live use stream")
         cameras = declare_fixed(self, "cameras", "", "what the topics of a rig begin with, between spaces; empty: one")
         self._selection = RigSelection(self._config, cameras.split())
-        compile_ahead()
+        warm_up()
         self._queue = ArrivalQueue(self._config.lockstep, MAX_QUEUE * len(self._selection.names))
         self._changes: deque[EncodedFrame | list[int]] = deque()  # keyframes to publish; stamps of some to retire
         self._ledger = Ledger(exact=self._config.lockstep)

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.rolled_image import RolledImage
+from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.boards.board_file import BoardFile
 from pipeprog_sfm.camera_in_use import FIRST_CHECK
 from pipeprog_sfm.config import SfmConfig
@@ -21,11 +23,12 @@ DEPTHS = (0.7, 1.5)
 STEP = 24  # px between two views of a wall at 1 m
 FEATURES = 600  # of a view: thrice the tie points that self-calibration asks for
 REACH = 2  # views on either side that a depth map is made with
+READOUT = 1e-3  # s, of a rolling shutter that moves nothing by a pixel
 
 
 def warm_up(config: SfmConfig) -> None:
     """Runs each stage on a few views of a plane; takes about a second once everything is compiled."""
-    config = replace(config, mapper=replace(config.mapper, max_features=FEATURES))
+    config = replace(config, readout=READOUT, mapper=replace(config.mapper, max_features=FEATURES))
     width, height = SIZE
     camera = Camera(width, height, 300.0, 300.0, (width - 1) / 2, (height - 1) / 2)
     wall = np.random.default_rng(0).integers(0, 256, (height // 4, width), np.uint8)
@@ -40,8 +43,15 @@ def warm_up(config: SfmConfig) -> None:
         views.append(StereoImage(number, Picture(image, camera), pose))
         reconstruction.add(number, cv2.imencode(".png", image)[1].tobytes(), camera)
         reconstruction.overlap_reports()
+    motion = RowMotion(READOUT, height, np.zeros(3), np.zeros(3))
+    rolling = [replace(view, rolled=RolledImage(motion, camera)) for view in views[: REACH + 1]]
+    depth_map(rolling[0], rolling[1:], DEPTHS)
     fusion = Fusion(config.fusion)
     for view in views:
         others = [other for other in views if 0 < abs(other.stamp - view.stamp) <= REACH]
         fusion.add(depth_map(view, others, DEPTHS), view.camera_from_world, 1.0)
     fusion.cloud()
+
+
+if __name__ == "__main__":
+    warm_up(SfmConfig())

@@ -14,7 +14,7 @@ from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 from pipeprog_bringup.recording.bag import Bag
 from pipeprog_camera.camera import Camera
-from pipeprog_frames.compiled_ahead import compile_ahead
+from pipeprog_frames.warm_up import warm_up
 from pipeprog_frames.incoming.decoding import decode_reduced
 from pipeprog_frames.corners import sharpness
 from pipeprog_frames.tracker import Tracker
@@ -26,7 +26,7 @@ def compiled():
     kernels = {id(each): each for module in modules for each in vars(module).values() if isinstance(each, Dispatcher)}
     return {each.__name__: len(each.signatures) for each in kernels.values()}
 
-compile_ahead()
+warm_up()
 before = compiled()
 for lens in ((), ("plumb_bob", (0.1, 0.0, 0.0, 0.0, 0.0)), ("equidistant", (0.1, 0.0, 0.0, 0.0))):
     tracker = Tracker(Camera(1280, 720, 900.0, 900.0, 640.0, 360.0, *lens))
