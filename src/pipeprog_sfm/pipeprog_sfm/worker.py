@@ -77,7 +77,7 @@ class Finish:
 
 @dataclass(frozen=True)
 class Ready:
-    """Event: all code is loaded, keyframes are processed without delay from now on."""
+    """Event: keyframes are processed from now on."""
 
 
 @dataclass(frozen=True)
@@ -144,11 +144,13 @@ def serve(
 ) -> None:
     """Processes commands from `connection` until it closes; those that a predecessor has answered come first.
 
-    Without `intermediate`, the only map is the one that Finish asks for, in the frame of the reference if there is one.
+    Without `intermediate`, the only map is the one that Finish asks for, in the frame of the reference if there is one;
+    as no keyframe is waited for, what each stage needs is loaded when its turn comes.
     With `ahead`, images that have come are prepared while the ones before are worked off; with intermediate maps the
     other cores make these. Should the process die of one of the images, it is not told of which.
     """
-    warm_up(config)
+    if intermediate:
+        warm_up(config)
     reconstruction = Reconstruction(config, board_file, reference=reference)
 
     def expect(command: Command) -> None:

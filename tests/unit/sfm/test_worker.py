@@ -135,13 +135,15 @@ def events(
 def test_a_replay_alone_is_read_ahead(
     ahead: bool, intermediate: bool, expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Live, the other cores make depth maps and find pipes."""
+    """Live, the other cores make depth maps and find pipes, and the first keyframe waits for nothing to be loaded."""
     channels: list[object] = []
-    monkeypatch.setattr(worker, "warm_up", lambda config: None)
+    warm: list[SfmConfig] = []
+    monkeypatch.setattr(worker, "warm_up", warm.append)
     monkeypatch.setattr(worker, "work", lambda channel, *others: channels.append(channel))
     connection = Pipe()[1]
     worker.serve(connection, SfmConfig(), BoardFile(), intermediate, None, ahead, ())
     assert isinstance(channels[0], Inbox) == expected
+    assert len(warm) == intermediate
 
 
 def test_no_map_follows_the_last_one() -> None:
