@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+from pipeprog_camera.cores import usable_cores
+
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
-# What a loop gives does not depend on it. Linux alone tells a process's cores.
-THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
+# What a loop gives does not depend on it.
+THREADS = min(usable_cores(), 8)
 
 
 def mapped(function: Callable[[Part], Result], parts: Iterable[Part]) -> list[Result]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeprog_camera.arrays import FloatArray
 from pipeprog_camera.camera import Camera
+from pipeprog_camera.cores import usable_cores
 from pipeprog_camera.rolled_image import RolledImage
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_camera.view_overlap import in_image, is_shown_beside, sample, view_overlap
@@ -37,7 +38,7 @@ LOOKAHEAD = 2  # later keyframes that a depth map waits for, so that it has neig
 # of 30 ms; with them by a tenth of that.
 FILLED = 3_000_000_000
 # Depth maps made at a time: each takes one core, and 130 MB at 720p.
-THREADS = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 4)
+THREADS = min(usable_cores(), 4)
 PICTURES = 12  # of keyframes at working resolution, 15 MB each at 720p: neighbours are mostly the last few
 NICENESS = 5  # of each thread, a third of the mapper's CPU share: the selector waits for poses, nobody for the cloud
 MIN_POINTS = 10  # of a keyframe, for the percentiles of its depths
