@@ -197,6 +197,10 @@ class Reconstruction:
         self._request(settled=True, final=True)
         return self._take()
 
+    def close(self) -> None:
+        """Gives up what has not been begun; nothing more can be asked for."""
+        self._dense.close()
+
     def write_colmap(self, folder: Path) -> None:
         """The sparse model in `map` for COLMAP, binary and as text; images are named by their stamps [ns]."""
         scale, trajectory = self._metric()

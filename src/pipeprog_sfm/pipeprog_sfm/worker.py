@@ -158,7 +158,10 @@ def serve(
             reconstruction.expect(command.stamp, command.encoded, command.camera)
 
     channel: Channel = Inbox(connection, expect) if ahead and not intermediate else connection
-    work(channel, reconstruction, config.map_interval if intermediate else None, answered)
+    try:
+        work(channel, reconstruction, config.map_interval if intermediate else None, answered)
+    finally:
+        reconstruction.close()
 
 
 def work(

@@ -169,6 +169,10 @@ class DenseMapper:
             del self._covered[stamp]
         self._between &= self._covered.keys()
 
+    def close(self) -> None:
+        """Gives up the depth maps that have not been begun, which the process would make before it ends."""
+        self._stereo.shutdown(wait=False, cancel_futures=True)
+
     def change_camera(self, shift: float) -> None:
         """Notes that another calibration or read-out moves a point of the images by `shift` px at most.
 

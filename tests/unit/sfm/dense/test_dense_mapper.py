@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import cv2
 import numpy as np
 import pytest
@@ -237,3 +239,21 @@ def test_a_depth_map_may_be_retired_while_a_cloud_of_it_is_awaited() -> None:
     cloud = dense.fuse(poses, poses, 1.0, complete=True, anew=True)
     dense.retire([max(poses)])
     assert len(cloud.result().points) > 1000
+
+
+def test_what_has_not_been_begun_is_given_up_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that ends would make all depth maps that wait first, each of which takes a second."""
+    begun, may_end = threading.Semaphore(0), threading.Event()
+
+    def made(*_: object) -> None:
+        begun.release()
+        may_end.wait()
+
+    monkeypatch.setattr(DenseMapper, "_depth", made)
+    dense, _, _ = walk([*range(24)])
+    for _ in range(dense_mapper.THREADS):
+        begun.acquire()
+    assert len(dense) > dense_mapper.THREADS
+    dense.close()
+    may_end.set()
+    assert sum(not future.cancelled() for future in dense._depths.values()) == dense_mapper.THREADS

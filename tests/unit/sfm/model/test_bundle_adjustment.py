@@ -57,12 +57,13 @@ def test_gross_errors_hardly_move_the_result() -> None:
 
 def test_residuals_are_those_of_the_pinhole_camera() -> None:
     noisy = bundle(noise=0.3)
+    residuals = noisy.residuals()
     for point, (first, last) in enumerate(zip(noisy.start[:-1], noisy.start[1:], strict=True)):
         for k in range(first, last):
             c = noisy.view[k]
             x, y, z = noisy.rotation[c] @ noisy.points[point] + noisy.translation[c]
             expected = noisy.focal[c] * ([x / z, y / z] - noisy.rays[k])
-            np.testing.assert_allclose(noisy.residuals()[k], expected, atol=1e-9)
+            np.testing.assert_allclose(residuals[k], expected, atol=1e-9)
 
 
 def test_the_cost_is_the_sum_of_the_logarithms() -> None:
