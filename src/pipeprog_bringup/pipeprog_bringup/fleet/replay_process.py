@@ -132,8 +132,8 @@ class _Command:
 
 
 def _threads(cores: int) -> dict[str, str]:
-    """Environment that gives the libraries of a process `cores` threads."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+    """Environment that gives the libraries of a process, and its own loops, `cores` threads."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
     return dict.fromkeys(names, str(cores))
 
 
