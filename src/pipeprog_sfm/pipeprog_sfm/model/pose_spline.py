@@ -27,7 +27,7 @@ def spline_rates(stamps: list[int], rotations: FloatArray, centres: FloatArray) 
         centres: (V, 3) of the cameras, in the model.
     """
     times = (np.array(stamps) - stamps[0]) * 1e-9
-    knots = _apart(times)
+    knots = apart(times)
     if len(knots) < 2:
         return (np.empty((0, 3)),) * 4
     turns = _unit_quaternions(rotations.transpose(0, 2, 1))
@@ -64,7 +64,7 @@ def _imaginary(turns: FloatArray, rates: FloatArray) -> FloatArray:
     return np.asarray(scalar * rates[:, :3] - rates[:, 3:] * vector - np.cross(rates[:, :3], vector))
 
 
-def _apart(times: FloatArray) -> NDArray[np.intp]:
+def apart(times: FloatArray) -> NDArray[np.intp]:
     """Indices of ascending times that are MIN_GAP apart, from the first one."""
     kept: list[int] = []
     for index, time in enumerate(times):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a view with a rolling shutter moves by its own rows: what fits its features beside known points best."""
+"""What the rows of a view with a rolling shutter tell of its motion: features beside known points, each at its time."""
 
 from __future__ import annotations
 
@@ -20,113 +20,94 @@ CONVERGED = 0.003
 MIN_POINTS = 50  # of a view, from which its own rows tell its motion: up to eighteen unknowns, and some wrong points
 
 
-@dataclass(frozen=True)
-class RowFit:
-    """The motion that fits a view's rows best, with another one as the prior.
+@dataclass
+class ViewRows:
+    """Known points beside the features that show them.
 
     Attributes:
-        motion: the one that fits.
-        moved: (6,) by how much its velocities differ from the prior's, angular (rad/s) and linear (units of the model
-            per second).
-        information: (6, 6) of the rows on these.
-        precision: (6,) of the prior, for a standard deviation of one.
-        sigma: the prior's standard deviation, rad/s, and depths of the scene per second.
+        inside: (K, 3) points in the camera's frame at the stamp; they move with its pose.
+        rays: (K, 2) normalised image coordinates of the features as measured.
+        times: (K,) when their rows are exposed, s after the stamp.
+        focal: (2,) focal lengths, px.
+        noise: of a feature, px.
     """
 
-    motion: RowMotion
-    moved: FloatArray
-    information: FloatArray
-    precision: FloatArray
-    sigma: float
+    inside: FloatArray
+    rays: FloatArray
+    times: FloatArray
+    focal: FloatArray
+    noise: float
+
+    @staticmethod
+    def of(inside: FloatArray, keyframe: Keyframe, features: IntArray, noise: float, motion: RowMotion) -> ViewRows:
+        """Of points (K, 3) in the camera's frame and the features (K,) that show them; those behind it are left out.
+
+        The times of rows are those of the motion's read-out.
+        """
+        ahead = inside[:, 2] > 0
+        camera = keyframe.camera
+        measured = keyframe.measured[features[ahead]].astype(np.float64)
+        times = motion.row_times(camera.distort_points(measured)[:, 1])
+        rays = (measured - [camera.cx, camera.cy]) / keyframe.focal
+        return ViewRows(inside[ahead], rays, times, keyframe.focal, noise)
 
     @property
-    def sigmas(self) -> FloatArray:
-        """(6,) standard deviations of its velocities if there were no prior; infinite where too few rows tell them."""
-        if not self.information.any():
-            return np.full(6, np.inf)
-        return np.sqrt(np.diag(np.linalg.pinv(self.information)))
+    def are_enough(self) -> bool:
+        """Whether they tell a motion."""
+        return len(self.inside) >= MIN_POINTS
 
     @property
-    def posterior(self) -> FloatArray:
-        """(6, 6) information of rows and prior on the velocities."""
-        return self.information + np.diag(self.precision / self.sigma**2)
+    def depth(self) -> float:
+        """Median depth of the points."""
+        return float(np.median(self.inside[:, 2]))
 
-    def changed(self, by: FloatArray) -> RowMotion:
-        """The motion with velocities that differ by (6,) from those of the prior."""
-        change = by - self.moved
-        return replace(self.motion, angular=self.motion.angular + change[:3], linear=self.motion.linear + change[3:])
+    def normal_equations(self, motion: RowMotion, bends: bool) -> tuple[FloatArray, FloatArray]:
+        """(U, U) information, and (U,) its product with the step to what fits best, with robust weights.
+
+        Unknowns: turn and shift of the pose, changes of the angular and the linear velocity and, with `bends`, of the
+        accelerations. The columns of the velocity are those of the pose times the row's time t, those of the
+        acceleration times t^2 / 2.
+        """
+        blocks = 3 if bends else 2
+        return _normal_equations(self.inside, self.rays, self.times, motion.rates, self.focal, self.noise, blocks)
+
+    def move(self, turn_and_shift: FloatArray) -> None:
+        """Goes on with another pose, from this one by (6,)."""
+        self.inside = self.inside @ rotation_from_vector(turn_and_shift[None, :3])[0].T + turn_and_shift[3:]
+
+    def step_size(self, step: FloatArray, information: FloatArray) -> float:
+        """Root mean square over the features, px, of what a step (U,) of all unknowns moves."""
+        return float(self.noise * np.sqrt(step @ information @ step / len(self.inside)))
 
 
-def fit_rows(
-    inside: FloatArray,
-    keyframe: Keyframe,
-    features: IntArray,
-    noise: float,
-    prior: RowMotion,
-    sigma: float,
-    bend_sigmas: FloatArray | None = None,
-) -> RowFit:
+def fit_rows(rows: ViewRows, prior: RowMotion, sigma: float) -> RowMotion:
     """The motion that fits a view's points best, with another one as the prior and the pose as it may be.
 
-    Gauss-Newton steps for pose, velocity and, with `bend_sigmas`, acceleration: the columns of the velocity are those
-    of the pose times the row's time t, those of the acceleration times t^2 / 2. Where the prior is off by much, its
-    rows are too, and count little by their robust weights: one step is not enough. With fewer than MIN_POINTS it is
-    the prior.
+    Where the prior is off by much, its rows are too, and count little by their robust weights: one step is not enough.
+    With fewer than MIN_POINTS it is the prior.
 
     Args:
-        inside: (K, 3) points in the camera's frame.
-        keyframe: of the view.
-        features: (K,) its features that show them.
-        noise: of a feature, px.
-        prior: motion expected.
+        rows: of the view; they go on with its pose.
+        prior: motion expected; its accelerations are kept.
         sigma: standard deviation of its velocities, rad/s, and depths of the scene per second.
-        bend_sigmas: (2,) of its angular and its linear accelerations, rad/s^2 and units of the model per s^2, where
-            they are sought, too.
     """
-    ahead = inside[:, 2] > 0
-    features, inside = features[ahead], inside[ahead]
-    if len(features) < MIN_POINTS:
-        return RowFit(prior, np.zeros(6), np.zeros((6, 6)), np.ones(6), sigma)
-    camera = keyframe.camera
-    measured = keyframe.measured[features].astype(np.float64)
-    times = prior.row_times(camera.distort_points(measured)[:, 1])
-    rays = (measured - [camera.cx, camera.cy]) / keyframe.focal
-    precision = np.repeat([1.0, 1.0 / float(np.median(inside[:, 2])) ** 2], 3)
-    held = precision / sigma**2
-    if bend_sigmas is not None and bend_sigmas.all():  # two poses tell no acceleration
-        held = np.concatenate([held, np.repeat(1.0 / bend_sigmas**2, 3)])
-    moved = np.zeros(len(held))
+    if not rows.are_enough:
+        return prior
+    held = np.repeat([1.0, 1.0 / rows.depth**2], 3) / sigma**2
+    moved = np.zeros(6)
     fitted = prior
     for _ in range(MAX_STEPS):
-        sums, pull = _normal_equations(inside, rays, times, fitted.rates, keyframe.focal, noise, 1 + len(held) // 6)
-        information = sums.copy()
-        information[range(12, 6 + len(held)), range(12, 6 + len(held))] += held[6:]
+        information, pull = rows.normal_equations(fitted, bends=False)
         normal = information.copy()
-        normal[range(6, 12), range(6, 12)] += held[:6]
+        normal[range(6, 12), range(6, 12)] += held
         pull[6:] -= held * moved
-        change = np.linalg.solve(normal, pull)
-        inside = inside @ rotation_from_vector(change[None, :3])[0].T + change[3:6]
-        moved += change[6:]
-        fitted = _changed(prior, moved)
-        if noise * np.sqrt(change @ sums @ change / len(inside)) < CONVERGED:
+        step: FloatArray = np.asarray(np.linalg.solve(normal, pull), np.float64)
+        rows.move(step[:6])
+        moved += step[6:]
+        fitted = replace(prior, angular=prior.angular + moved[:3], linear=prior.linear + moved[3:])
+        if rows.step_size(step, information) < CONVERGED:
             break
-    own = np.r_[6:12]
-    other = np.setdiff1d(np.arange(len(information)), own)
-    both = information[np.ix_(other, own)]
-    of_velocity = information[np.ix_(own, own)] - both.T @ np.linalg.solve(information[np.ix_(other, other)], both)
-    return RowFit(fitted, moved[:6], of_velocity, precision, sigma)
-
-
-def _changed(motion: RowMotion, by: FloatArray) -> RowMotion:
-    """With other velocities and, where (12,) are given, accelerations."""
-    turn, shift, twist, bend = np.concatenate([by, np.zeros(12 - len(by))]).reshape(4, 3)
-    return replace(
-        motion,
-        angular=motion.angular + turn,
-        linear=motion.linear + shift,
-        angular_acceleration=motion.angular_acceleration + twist,
-        linear_acceleration=motion.linear_acceleration + bend,
-    )
+    return fitted
 
 
 @njit(cache=True, nogil=True)

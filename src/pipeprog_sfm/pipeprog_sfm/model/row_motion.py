@@ -1,52 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rolling shutter of a sparse model: how each view moves, and its features where the middle row's camera has them.
 
-The velocities are those of a spline through the poses (`pose_spline`), and never unknowns of each view: velocities that
-are free, even by 0.02 rad/s and 0.04 m/s, bend the scene at no cost where all images are read out in one direction
-(Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2 m/s off after some rounds of adjustment). What the rows of a view
-tell beside points that many views hold corrects its velocity: in a long trajectory what changes from view to view
-(`row_corrections`), all of it in the outermost views, where a spline is poor, and for what is predicted of a new view.
-The accelerations are those of the spline: at 3 m/s^2, first and last row of 20 ms lie 0.15 mm off without them, which
-moves a pose by several times as much along what the rows hold poorly. Those of the outermost views are told by their
-rows, too: a spline knows nothing of what is beyond them.
+The velocities are never unknowns of each view alone: velocities that are free, even by 0.02 rad/s and 0.04 m/s, bend
+the scene at no cost where all images are read out in one direction (Albl, Sugimoto, Pajdla, ECCV 2016; seen here: 0.2
+m/s off after some rounds of adjustment). They are those of a smooth trajectory through the poses, and what the rows of
+a view tell beside points that many views hold moves it between these (`motion_smoothing`). The accelerations are its
+own, too: at 3 m/s^2, first and last row of 20 ms lie 0.15 mm off without them, which moves a pose by several times as
+much along what the rows hold poorly.
 
 Features are shifted by velocity and depth to where a camera with all rows at the stamp would have seen them, and all
 that follows is that of a global shutter. Shifts and poses are found in turns. An error of the poses that repeats every
 T seconds comes back through the velocities multiplied by pi * readout / T, a tenth where keyframes are 0.2 s apart and
 the read-out is 15 ms: three turns do. What bends the scene and the velocities that rows tell together comes back nearly
 as it was, though (0.94 of it, at 1.4 m/s). It is there after another read-out, and where a map has grown: turns by the
-spline alone undo it, before those in which rows correct.
+poses alone (`pose_spline`) undo it, before those in which rows correct.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Container, Iterable, Mapping, MutableMapping
+from collections.abc import Container, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeprog_camera.arrays import FloatArray, IntArray
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.features.keyframe import Keyframe
-from pipeprog_sfm.model.pose_spline import spline_rates
-from pipeprog_sfm.model.row_corrections import contradicted, corrections
-from pipeprog_sfm.model.row_fit import RowFit, fit_rows
+from pipeprog_sfm.model.motion_smoothing import smoothed
+from pipeprog_sfm.model.pose_spline import apart, spline_rates
+from pipeprog_sfm.model.row_fit import ViewRows, fit_rows
 from pipeprog_sfm.model.sparse_model import SparseModel
 
 MAX_GAP = 1.0  # s between two views that still tell the velocity between them: a hand sways at 1 to 2 Hz
-NEAR = 16  # views nearest in time that tell how one moves: a knot has 0.43 of the say of the one before, see DECAY
-# rad/s and depths of the scene per second, for each second to the next pose: how far the velocity at an end of the
-# spline is off, which follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
+NEAR = 16  # views nearest in time that tell how one moves: a knot has 0.43 of the say of the one before
+# rad/s and depths of the scene per second, for each second to the next pose: how far a predicted velocity is off, which
+# follows a hand's accelerations (1 rad/s^2, 1 m/s^2 at 1 to 2 m) from one side alone.
 END_CHANGE = 1.0
-# Knots of such a spline from an end inwards that its condition moves, each 0.43 times as much as the one before; of the
-# fifth it is a thirtieth.
-END_KNOTS, DECAY = 4, 0.43
-# Views of a trajectory whose rows correct all of them together, of which these at its ends are a quarter at most: of
-# nine, six whose rows decide bend the scene. In a shorter one, and in a window of the nearest views, those of the
-# outermost alone count.
+# Views from an end inwards whose spline its condition moves, each 0.43 times as much as the one before; the fifth by a
+# thirtieth.
+END_KNOTS = 4
+# Views of a trajectory of which these, at its ends, are a quarter at most: of nine, six whose rows decide bend the
+# scene. In a shorter one that is left to the outermost alone.
 LONG_TRAJECTORY = 4 * 2 * END_KNOTS
+# Standard deviations, as the median of all has it, by which what rows tell differs from the spline where that is wrong,
+# as at a jerk: with six numbers of each of 100 views, by chance in one trajectory of 25.
+CONTRADICTED = 4.0
+NORMAL_SPREAD = 1.4826  # standard deviations of a normal distribution in its median absolute deviation
 READOUT_STEP = 1e-4  # s of a numerical derivative: moves a feature by 0.01 px, far above rounding (1e-9)
 # Views of a point that tells how one of them moves: with fewer, that view has too much say in where the point is, and
 # the point follows the view's own error.
@@ -102,7 +104,7 @@ def row_motions(
             }
             if motions and readout > 0.0:
                 is_long = near is None and len(part) >= LONG_TRAJECTORY
-                decided, corrected = _by_own_rows(model, part, keyframes, motions, wanted, is_long)
+                decided, corrected = _by_rows(model, part, keyframes, motions, wanted, is_long)
                 found.decided.update(decided)
                 found.corrected.update(corrected)
             asked = {model.stamps[view] for view in part if view in wanted}
@@ -190,7 +192,7 @@ def told_by_rows(
     """
     gap = int(np.abs(np.array(model.stamps) - keyframe.stamp).min()) * 1e-9
     inside = model.points[pairs[:, 1]] @ camera_from_model[:3, :3].T + camera_from_model[:3, 3]
-    return fit_rows(inside, keyframe, pairs[:, 0], model.noise, motion, END_CHANGE * gap).motion
+    return fit_rows(ViewRows.of(inside, keyframe, pairs[:, 0], model.noise, motion), motion, END_CHANGE * gap)
 
 
 def near_in_time(model: SparseModel, stamp: int) -> IntArray:
@@ -210,7 +212,7 @@ def feature_depths(model: SparseModel, view: int, keyframe: Keyframe) -> FloatAr
     return np.asarray(depths)
 
 
-def _by_own_rows(
+def _by_rows(
     model: SparseModel,
     views: IntArray,
     keyframes: Mapping[int, Keyframe],
@@ -218,42 +220,35 @@ def _by_own_rows(
     wanted: Container[int],
     is_long: bool,
 ) -> tuple[dict[int, RowMotion], dict[int, RowMotion]]:
-    """The spline's `motions` of the `wanted` among views in order of time: `decided` and `corrected`, by stamp.
+    """The spline's `motions` of the `wanted` among views in order of time, as rows have them: `decided`, `corrected`.
 
-    The rows alone decide for the outermost views. In a long trajectory they correct all others, and the spline is no
-    alternative for END_KNOTS at each end and for those that contradict it.
+    Both by stamp; the spline is no alternative at the ends, and where what rows tell contradicts it.
     """
     stamps = [model.stamps[view] for view in views]
-    gaps = np.diff(stamps, prepend=stamps[0], append=stamps[-1]) * 1e-9
-    sigmas = END_CHANGE * np.maximum(gaps[:-1], gaps[1:])
+    times = (np.array(stamps) - stamps[0]) * 1e-9
     has_many = np.bincount(model.point_of[model.point_of >= 0], minlength=len(model.points)) >= LONG_TRACK
 
-    def fitted(number: int, sigma: float, bend_sigmas: FloatArray | None = None) -> RowFit:
-        view, stamp = views[number], stamps[number]
+    def rows_of(view: int, stamp: int) -> ViewRows | None:
+        if view not in wanted or not (is_long or view in (views[0], views[-1])):
+            return None
         own = model.point_of[model.features(view)]
         features = np.flatnonzero((own >= 0) & has_many[own])
         inside = model.points[own[features]] @ model.rotation[view].T + model.translation[view]
-        return fit_rows(inside, keyframes[stamp], features, model.noise, motions[stamp], sigma, bend_sigmas)
+        return ViewRows.of(inside, keyframes[stamp], features, model.noise, motions[stamp])
 
-    numbers = np.array([number for number, view in enumerate(views.tolist()) if view in wanted], np.intp)
-    knots = np.minimum(numbers, len(views) - 1 - numbers)
-    bends = _bends(motions.values())  # an end bends as the walk does
-    decided = {stamps[number]: fitted(number, sigmas[number], bends).motion for number in numbers[knots == 0]}
-    if not is_long:
-        return decided, {}
-    inner, knots = numbers[knots > 0], knots[knots > 0]
-    fits = [fitted(number, sigmas[number]) for number in inner]
-    times = np.array([stamps[number] - stamps[0] for number in inner]) * 1e-9
-    changes = corrections(fits, times, model.rotation[views[inner]], sigmas[inner] * DECAY**knots)
-    corrected = [fit.changed(change) for fit, change in zip(fits, changes, strict=True)]
-    is_wrong = contradicted(np.abs([fit.moved / fit.sigmas for fit in fits]))
-    for number, knot, wrong, motion in zip(inner, knots, is_wrong, corrected, strict=True):
-        if wrong or knot < END_KNOTS:
-            decided[stamps[number]] = motion
-    return decided, {stamps[number]: motion for number, motion in zip(inner, corrected, strict=True)}
+    knots = apart(times)
+    views, stamps = views[knots], [stamps[knot] for knot in knots]
+    before = [motions[stamp] for stamp in stamps]
+    rows = [rows_of(view, stamp) for view, stamp in zip(views.tolist(), stamps, strict=True)]
+    after, differences = smoothed(times[knots], model.rotation[views], model.centres()[views], before, rows)
+    is_wrong = contradicted(differences)
+    ends = END_KNOTS if is_long else 1
+    is_wrong[:ends] = is_wrong[-ends:] = True
+    numbers = [number for number, view in enumerate(views.tolist()) if view in wanted]
+    corrected = {stamps[number]: after[number] for number in numbers}
+    return {stamps[number]: after[number] for number in numbers if is_wrong[number]}, corrected
 
 
-def _bends(motions: Iterable[RowMotion]) -> FloatArray:
-    """(2,) root mean square of the angular and the linear accelerations, rad/s^2 and units of the model per s^2."""
-    rates = [(motion.angular_acceleration, motion.linear_acceleration) for motion in motions]
-    return np.asarray(np.sqrt(np.square(rates).mean(axis=(0, 2))))
+def contradicted(apart: FloatArray) -> NDArray[np.bool_]:
+    """(N,) whether any of (N, 6) differences [standard deviations, not negative] is beyond most others of its kind."""
+    return np.asarray((apart > CONTRADICTED * NORMAL_SPREAD * np.median(apart, axis=0)).any(axis=1))

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scenes import CAMERA, STEP, pose, position_errors, rates_of, view
-from scipy.spatial.transform import Rotation
 
 from pipeprog_camera.rolling_shutter import RowMotion
 from pipeprog_sfm.config import MapperConfig
 from pipeprog_sfm.features.keyframe import Keyframe
 from pipeprog_sfm.features.sift import Features
-from pipeprog_sfm.model.row_fit import fit_rows
+from pipeprog_sfm.model.motion_smoothing import smoothed
+from pipeprog_sfm.model.row_fit import ViewRows, fit_rows
 from pipeprog_sfm.model.row_motion import row_motions, told_by_rows
 from pipeprog_sfm.model.self_calibration import TOLERATED_SHIFT, Priors
 from pipeprog_sfm.model.sparse_model import SparseModel
@@ -128,45 +128,14 @@ def test_a_read_out_that_was_off_leaves_no_trace(
     assert of_other < 1.1 * of_told
 
 
-def test_the_acceleration_of_a_view_is_told_by_its_rows() -> None:
-    """It is off by 10 m/s^2 as a spline's is where a walk begins: 0.4 px at the first row and at the last one."""
-    rng = np.random.default_rng(1)
-    points = rng.uniform([-1.2, -0.6, 1.5], [1.2, 0.6, 2.5], (2000, 3))
-    true = RowMotion(READOUT, CAMERA.height, *np.array([[1.4, 0.2, 0], [0.1, 0.3, 0], [8.0, -2.0, 4.0], [0, -2.0, 0]]))
-    pixels = _shown(points, true) + rng.normal(0.0, 0.1, (len(points), 2))
-    keyframe = Keyframe.of(0, Features(pixels.astype(np.float32), np.zeros((len(pixels), 128), np.float32)), CAMERA)
-    spline = replace(
-        true, linear_acceleration=np.array([-2.0, -2.0, 4.0]), linear=true.linear + np.array([0.0, 0.05, 0.0])
-    )
-    every = np.arange(len(points))
-    held, free = (fit_rows(points, keyframe, every, 0.1, spline, 0.2, bends) for bends in (None, np.array([3.0, 5.0])))
-    np.testing.assert_array_equal(held.motion.linear_acceleration, spline.linear_acceleration)
-    np.testing.assert_allclose(free.motion.linear_acceleration, true.linear_acceleration, atol=3.0)
-    np.testing.assert_allclose(free.motion.linear, true.linear, atol=0.03)
-
-
-def _shown(points: NDArray[np.float64], motion: RowMotion) -> NDArray[np.float64]:
-    """(N, 2) pixels of points (N, 3) in the camera's frame, each at the time of its own row, found by iteration."""
-    times: NDArray[np.float64] = np.zeros(len(points), np.float64)
-    pixels: NDArray[np.float64] = np.zeros((len(points), 2), np.float64)
-    for _ in range(10):
-        time = times[:, None]
-        turns = Rotation.from_rotvec((motion.angular + 0.5 * motion.angular_acceleration * time) * time)
-        x, y, z = (turns.apply(points) + (motion.linear + 0.5 * motion.linear_acceleration * time) * time).T
-        pixels = np.stack([CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy], axis=1)
-        times = np.asarray(motion.row_times(CAMERA.distort_points(pixels)[:, 1]), np.float64)
-    return pixels
-
-
 def test_few_points_tell_no_velocity(told: tuple[Mapper, dict[int, NDArray[Any]]]) -> None:
     """A view that has lost its points must not count among those whose rows contradict the spline."""
     mapper = told[0]
     keyframe, prior = mapper.map.keyframes[4 * STEP], mapper.map.motions(mapper.map.published)[4 * STEP]
-    fit = fit_rows(np.ones((10, 3)), keyframe, np.arange(10), 0.3, prior, 0.2)
-    assert (fit.sigmas == np.inf).all()
-    for motion in (fit.motion, fit.changed(np.zeros(6))):
-        np.testing.assert_array_equal(motion.linear, prior.linear)
-        np.testing.assert_array_equal(motion.angular, prior.angular)
+    rows = ViewRows.of(np.ones((10, 3)), keyframe, np.arange(10), 0.3, prior)
+    assert fit_rows(rows, prior, 0.2) is prior
+    times, rest = np.array([0.0, 0.2]), np.tile(np.eye(3), (2, 1, 1))
+    assert smoothed(times, rest, np.zeros((2, 3)), [prior, prior], [rows, None])[0] == [prior, prior]
 
 
 def test_a_sway_between_two_poses_is_told() -> None:
