@@ -78,7 +78,7 @@ def smoothed(
             of_pose = np.linalg.solve(sums[:6, :6], np.c_[sums[:6, 6:], towards[:6]])
             of_rates = sums[6:, 6:] - sums[6:, :6] @ of_pose[:, :-1]
             towards_rates = towards[6:] - sums[6:, :6] @ of_pose[:, -1]
-            covariance = np.linalg.inv(of_rates[:6, :6])
+            covariance = np.linalg.inv(of_rates[:6, :6] + np.diag(walk.held[:6]))
             alone = (_rates(found[number]) - _rates(motions[number]))[:6] + covariance @ towards_rates[:6]
             apart[number] = np.abs(alone) / np.sqrt(np.diag(covariance))
             turned = camera_from_model[number].T
@@ -109,7 +109,8 @@ class _Walk:
         self._gaps = gaps
         self._turns = (model_from_camera[1:] * model_from_camera[:-1].inv()).as_rotvec()
         self._shifts = np.diff(centres, axis=0)
-        self._units = np.array([1.0, depth])  # of angular and of linear numbers
+        units = np.array([1.0, depth])  # of angular and of linear numbers
+        self.held = np.tile(np.repeat((UNHEARD_OF * units) ** -2, 3), RATES)  # (18,) information on any state
         # What an interval adds to the way and its derivatives beside a steady jerk, from the derivatives at its begin
         # and at its end.
         added = np.zeros((len(gaps), RATES + 1, 2 * RATES))
@@ -123,7 +124,7 @@ class _Walk:
         self._added = self._whitened @ added
         self._turning = turning
         nothing = np.zeros((len(times), TOLD, TOLD)), np.zeros((len(times), TOLD))
-        prior = SNAP * self._units[:, None] ** 2  # variances along the axes
+        prior = SNAP * units[:, None] ** 2  # variances along the axes
         self._axes = np.tile(np.eye(3), (2, 1, 1))  # as columns
         self._variances = np.repeat(prior, 3, axis=1)
         self._trust = np.ones((len(gaps), 2, 3))
@@ -183,7 +184,7 @@ class _Walk:
         for part in range(2):
             blocks[:, :, part, :, :, part] = np.einsum("nkl,ncd->nkcld", pairs, precision[:, part])
         bands = np.zeros((2 * STATE, STATE * count))  # of the lower half: diagonals as rows
-        bands[0] = np.tile(np.repeat((UNHEARD_OF * self._units) ** -2, 3), RATES * count)
+        bands[0] = np.tile(self.held, count)
         _add_to_bands(bands, blocks.reshape(-1, 2 * STATE, 2 * STATE))
         _add_to_bands(bands, information)
         towards = np.zeros((count, STATE))

@@ -249,6 +249,6 @@ def _by_rows(
     return {stamps[number]: after[number] for number in numbers if is_wrong[number]}, corrected
 
 
-def contradicted(apart: FloatArray) -> NDArray[np.bool_]:
+def contradicted(differences: FloatArray) -> NDArray[np.bool_]:
     """(N,) whether any of (N, 6) differences [standard deviations, not negative] is beyond most others of its kind."""
-    return np.asarray((apart > CONTRADICTED * NORMAL_SPREAD * np.median(apart, axis=0)).any(axis=1))
+    return np.asarray((differences > CONTRADICTED * NORMAL_SPREAD * np.median(differences, axis=0)).any(axis=1))

@@ -181,6 +181,17 @@ def test_rows_that_contradict_the_motion_are_told() -> None:
     assert apart[15, 1] > 20.0 > np.median(apart)
 
 
+def test_one_row_tells_no_motion() -> None:
+    """All features in one row, as of a band of texture: they tell a pose, and the poses tell the motion."""
+    times = STEP * np.arange(20, dtype=np.float64)
+    rng = np.random.default_rng(1)
+    rows = [rows_at(walk, time, rng) for time in times]
+    rows = [replace(each, times=np.full_like(each.times, 0.01)) for each in rows]
+    found, differences = smoothed(times, *walk(times), true_motions(walk, times), rows)
+    assert np.abs(velocities(found) - velocities(true_motions(walk, times)))[INNER].max() < 0.1
+    assert np.isfinite(differences).all()
+
+
 def test_a_walk_without_rows_stays() -> None:
     times = STEP * np.arange(5, dtype=np.float64)
     motions = by_spline(walk, times)
