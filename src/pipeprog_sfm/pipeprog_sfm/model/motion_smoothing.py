@@ -73,8 +73,9 @@ def smoothed(
     walk = _Walk(times, rotations, centres, state[:, :3], float(np.median([each.depth for each in told.values()])))
     for _ in range(MAX_STEPS):
         information, pull = np.zeros((len(times), TOLD, TOLD)), np.zeros((len(times), TOLD))
-        equations = {number: each.normal_equations(found[number], bends=True) for number, each in told.items()}
-        for number, (sums, towards) in equations.items():
+        solved = {}  # information, and what the pose loses with each rate, and its own step
+        for number, each in told.items():
+            sums, towards = each.normal_equations(found[number], bends=True)
             of_pose = np.linalg.solve(sums[:6, :6], np.c_[sums[:6, 6:], towards[:6]])
             of_rates = sums[6:, 6:] - sums[6:, :6] @ of_pose[:, :-1]
             towards_rates = towards[6:] - sums[6:, :6] @ of_pose[:, -1]
@@ -84,12 +85,13 @@ def smoothed(
             turned = camera_from_model[number].T
             information[number] = turned @ of_rates @ turned.T
             pull[number] = turned @ towards_rates + information[number] @ state[number]
+            solved[number] = sums, of_pose
         state = walk.solve(information, pull)
         before, found = found, [_motion(*each) for each in zip(motions, camera_from_model, state, strict=True)]
         largest = 0.0
-        for number, (sums, towards) in equations.items():
+        for number, (sums, of_pose) in solved.items():
             change = _rates(found[number]) - _rates(before[number])
-            step = np.concatenate([np.linalg.solve(sums[:6, :6], towards[:6] - sums[:6, 6:] @ change), change])
+            step = np.concatenate([of_pose[:, -1] - of_pose[:, :-1] @ change, change])
             told[number].move(step[:6])
             largest = max(largest, told[number].step_size(step, sums))
         if largest < CONVERGED:
@@ -122,6 +124,7 @@ class _Walk:
                 added[:, row, RATES + row - 1] = 1.0
         self._whitened = WHITEN * gaps[:, None, None] ** -POWERS
         self._added = self._whitened @ added
+        self._pairs = self._added.swapaxes(1, 2) @ self._added
         self._turning = turning
         nothing = np.zeros((len(times), TOLD, TOLD)), np.zeros((len(times), TOLD))
         prior = SNAP * units[:, None] ** 2  # variances along the axes
@@ -179,10 +182,9 @@ class _Walk:
         """(N, 18) states by the present weights."""
         count = len(pull)
         precision = np.einsum("pcd,npd,ped->npce", self._axes, self._trust / self._variances, self._axes)
-        pairs = self._added.swapaxes(1, 2) @ self._added
         blocks = np.zeros((count - 1, 2 * RATES, 2, 3, 2 * RATES, 2, 3))
         for part in range(2):
-            blocks[:, :, part, :, :, part] = np.einsum("nkl,ncd->nkcld", pairs, precision[:, part])
+            blocks[:, :, part, :, :, part] = np.einsum("nkl,ncd->nkcld", self._pairs, precision[:, part])
         bands = np.zeros((2 * STATE, STATE * count))  # of the lower half: diagonals as rows
         bands[0] = np.tile(self.held, count)
         _add_to_bands(bands, blocks.reshape(-1, 2 * STATE, 2 * STATE))
