@@ -11,6 +11,7 @@ from pipeprog_camera.arrays import FloatArray
 from pipeprog_detect.refinement.axial_evidence import FARTHEST, TOLERANCE, AxialEvidence, axial_evidence
 from pipeprog_detect.refinement.contour_adjustment import MODEL_ERROR, AdjustedCylinder, adjusted
 from pipeprog_detect.refinement.global_search import MOST_SAMPLES, best_steps
+from pipeprog_detect.silhouette.apparent_contour import ContourSamples
 from pipeprog_detect.silhouette.edge_support import SupportProfile, support_profile
 from pipeprog_detect.silhouette.free_space import free_stretches
 from pipeprog_detect.silhouette.scene import Scene
@@ -145,10 +146,10 @@ def _turned(known: AdjustedCylinder, held: FloatArray) -> Scene | None:
     share = min(AHEAD, FARTHEST / cylinder.length)
     further = share * cylinder.length * cylinder.axis
     ends = np.kron([[1.0 + share, -share], [-share, 1.0 + share]], np.eye(2))
-    reach = SURELY * np.sqrt(np.diag(ends @ known.covariance[:4, :4] @ ends.T))
-    gain = float(np.median(known.samples.gain))
-    if reach.max() * gain < TOLERANCE:
+    covariance = ends @ known.covariance[:4, :4] @ ends.T
+    if SURELY * _contour_sigma(known.samples, covariance) < TOLERANCE:
         return None
+    reach = SURELY * np.sqrt(np.diag(covariance))
     longer = Cylinder(cylinder.start - further, cylinder.end + further, cylinder.radius)
     ahead = replace(known.scene, cylinder=longer)
     samples = ahead.samples(limit=MOST_SAMPLES)
@@ -163,6 +164,16 @@ def _turned(known: AdjustedCylinder, held: FloatArray) -> Scene | None:
     half = 0.5 * cylinder.length * turned.cylinder.axis
     middle = turned.cylinder.middle
     return replace(known.scene, cylinder=Cylinder(middle - half, middle + half, cylinder.radius))
+
+
+def _contour_sigma(samples: ContourSamples, covariance: FloatArray) -> float:
+    """Standard deviation [px] of the contour at the ends, whose `covariance` (4, 4) is given, of the view with most.
+
+    A step away from the cameras moves it by the parallax between these alone.
+    """
+    aside = samples.jacobian[:, 0:2] + samples.jacobian[:, 2:4]  # for a step of both ends
+    variances = [np.einsum("ni,ij,nj->n", aside, covariance[k : k + 2, k : k + 2], aside) for k in (0, 2)]
+    return float(np.sqrt(np.max(variances)))
 
 
 def extended(scene: Scene) -> Cylinder:

@@ -61,6 +61,22 @@ def test_a_cylinder_too_short_for_a_direction_is_extended_along_the_edges_ahead(
     assert fit.cylinder.length == pytest.approx(PIPE.length, abs=2.0 * END_TOLERANCE)
 
 
+@pytest.mark.parametrize(
+    ("sideways", "away", "is_sought"),
+    [(1e-4, 1e-4, False), (1e-2, 1e-4, True), (1e-4, 1e-2, False)],  # m
+)
+def test_the_direction_is_sought_where_it_would_move_the_contour(
+    pipe_views: list[View], sideways: float, away: float, is_sought: bool
+) -> None:
+    """One view hardly shows a step away from it: the contour lies where it is sought, however far the pipe may be."""
+    middle = pipe_views[len(pipe_views) // 2]
+    known = adjusted(Scene.of(PIPE, [middle, middle], []), np.eye(5), np.zeros(5))
+    assert known is not None
+    covariance = np.diag([sideways, away, sideways, away, 1e-4]) ** 2
+    turned = extension._turned(replace(known, covariance=covariance), np.eye(5))
+    assert (turned is not None) == is_sought
+
+
 @pytest.mark.parametrize("seen", [0.05, 0.1])
 def test_a_stub_is_not_cut_to_less_than_its_width(
     pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, seen: float
