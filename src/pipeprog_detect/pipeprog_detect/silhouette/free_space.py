@@ -30,6 +30,9 @@ STANDING_OUT = 0.015
 # within the limb. The barrel is three quarters of the radius before its axis there; what lies behind the axis by half
 # of the radius is none of it.
 BESIDE, BEHIND_LIMB = 0.65, 0.5
+# What shines through a hole in the cloud of something that is not smooth, such as a flange, is not seen on both sides
+# of the axis as well: there it is looked at here, in radii.
+ASIDE = 0.5
 # A stretch whose contour is seen is no gap. It is looked at this often [px].
 SPACING = 6
 # Logarithm of the odds from which a contour is decisively none (Jeffreys: a hundred to one).
@@ -88,8 +91,7 @@ def is_empty_beside(cylinder: Cylinder, views: Sequence[View], others: Sequence[
     through, on_it, seeing = np.zeros(2), np.zeros(2), np.zeros(2)
     for index in np.flatnonzero(ViewArrays.of(views).showing(axis)) if views else ():
         view = views[index]
-        across = np.cross(cylinder.axis, axis - view.centre)
-        across *= BESIDE * cylinder.radius / np.linalg.norm(across, axis=1)[:, None]
+        across = BESIDE * cylinder.radius * _across(cylinder, axis, view)
         for side, points in enumerate((axis - across, axis + across)):
             _, depth, nearest = _seen_at(points, room, view, rows)
             behind = nearest > depth + reach
@@ -114,7 +116,7 @@ def _seen_through(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cy
     behind: NDArray[np.bool_] = np.zeros((0, count), bool)
     before: FloatArray = np.zeros(count)
     for index in np.flatnonzero(ViewArrays.of(views).showing(points)) if views else ():
-        through, opaque = _looked_through(points, cylinder.radius, views[index], rows)
+        through, opaque = _looked_through(points, cylinder, views[index], rows)
         behind, before = np.vstack([behind, through]), before + opaque
     seen = behind.sum(axis=0)
     free = (seen >= MIN_AT_ONCE) & (seen > MIN_SHARE * (seen + before))
@@ -128,19 +130,37 @@ def _seen_through(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cy
 
 
 def _looked_through(
-    points: FloatArray, radius: float, view: View, others: FloatArray
+    points: FloatArray, cylinder: Cylinder, view: View, others: FloatArray
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Masks (N,) of the points (N, 3) behind which the view sees a surface, and at which it sees one.
+    """Masks (N,) of the points (N, 3) of the axis behind which the view sees a surface, and at which it sees one.
 
-    A view tells where the cell of its depths would lie within the silhouette of a pipe of `radius` [m]: of thinner ones
-    stereo shows the wall behind them. What is nearer than the pipe's barrel would be hides the point.
+    A view tells where the cell of its depths would lie within the silhouette of the pipe: of thinner ones stereo shows
+    the wall behind them. What is nearer than the pipe's barrel would be hides the point.
     """
     through, opaque = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    looked, behind, on_it = _compared(points, cylinder.radius, view, others)
+    through[looked], opaque[looked] = behind, on_it
+    across = _across(cylinder, points, view)
+    for aside in (-ASIDE * cylinder.radius * across, ASIDE * cylinder.radius * across):
+        seen = np.flatnonzero(through)
+        looked, behind, on_it = _compared(points[seen] + aside[seen], cylinder.radius, view, others)
+        through[seen[looked]], opaque[seen[looked]] = behind, on_it
+    return through, opaque
+
+
+def _compared(
+    points: FloatArray, radius: float, view: View, others: FloatArray
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Rows (M,) of the points (N, 3) where a view tells, and masks (M,): it sees what is behind them, or the pipe."""
     looked, depth, nearest = _seen_at(points, radius, view, others)
     behind = depth + max(BEFORE, BEHIND_RADII * radius)
-    through[looked] = nearest > behind
-    opaque[looked] = (nearest <= behind) & (nearest > depth - radius - STANDING_OUT)
-    return through, opaque
+    return looked, nearest > behind, (nearest <= behind) & (nearest > depth - radius - STANDING_OUT)
+
+
+def _across(cylinder: Cylinder, points: FloatArray, view: View) -> FloatArray:
+    """Unit vectors (N, 3) across the axis and the lines of sight to points (N, 3) on it."""
+    across = np.cross(cylinder.axis, points - view.centre)
+    return np.asarray(across / np.linalg.norm(across, axis=1)[:, None], np.float64)
 
 
 def _seen_at(

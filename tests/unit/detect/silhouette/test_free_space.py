@@ -79,6 +79,18 @@ def test_what_stands_before_a_gap_is_no_barrel() -> None:
     assert -0.14 - RESOLVED < stretch[0] - HALF < stretch[1] - HALF < 0.14 + RESOLVED
 
 
+@pytest.mark.parametrize(("half_hole", "is_free"), [(0.02, False), (0.12, True)])
+def test_what_shines_through_a_hole_in_a_flange_is_no_gap(half_hole: float, is_free: bool) -> None:
+    """Of a ring around two ends the cloud lacks what lies nearer than this [m] to the axis, in front."""
+    radius, half_gap = 0.1, 0.06
+    ring = tube(-half_gap, half_gap, 1.4 * radius)
+    ring = ring[np.abs(ring[:, 2]) > half_hole]
+    stretches = free_stretches(
+        line(radius), seen(tube(-HALF, -half_gap, radius), tube(half_gap, HALF, radius), ring), []
+    )
+    assert bool(stretches) == is_free
+
+
 def test_a_hidden_gap_is_not_told() -> None:
     column = Cylinder(np.array([0.0, -0.3, -1.0]), np.array([0.0, -0.3, 1.0]), 0.45)
     views = seen(tube(-HALF, -0.1, 0.03), tube(0.1, HALF, 0.03))
