@@ -172,7 +172,12 @@ class SceneContext:
         through = [each.normal for each in along if abs(each.normal @ cylinder.middle - each.offset) < nearest]
         two_meet = any(abs(one @ other) < CORNER for one, other in combinations(through, 2))
         reach = nearest + (_FOOT if two_meet else _LEAST_BESIDE)
-        points = self.walls.points[self.walls.near_segment(cylinder.start, cylinder.end, reach)]
+        walls, rest = (
+            tree.points[tree.near_segment(cylinder.start, cylinder.end, reach)] for tree in (self.walls, self.tree)
+        )
+        # A strip of a wall between two pipes is too narrow to be found as a plane, or a part of one.
+        on_wall = [np.abs(rest @ plane.normal - plane.offset) < self.clearance for plane in along]
+        points = np.concatenate([walls, rest[np.any(on_wall, axis=0)]]) if along else walls
         foot = cylinder.at(cylinder.along(points) / cylinder.length)
         touching = np.linalg.norm(points - foot, axis=1) < nearest
         for plane in along:

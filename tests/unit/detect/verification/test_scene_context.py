@@ -135,6 +135,15 @@ def test_a_wall_that_ends_beside_a_line_goes_on_to_it(gap: float, before: float,
     assert around.touches_wall(upright(0.0, -before * RADIUS)) is touches
 
 
+@pytest.mark.parametrize(("behind", "touches"), [(0.0, True), (0.02, False)])
+def test_a_strip_of_a_wall_that_was_found_as_no_plane_is_a_wall(behind: float, touches: bool) -> None:
+    """`behind` [m]: of the strip's points, from the plane that was found elsewhere."""
+    strip = octree.build(wall([-0.02, behind, 0.0], [0.02, behind, 1.0]))
+    elsewhere = octree.build(wall([0.3, 0.0, 0.0], [0.5, 0.0, 1.0]))
+    around = SceneContext(strip, None, [Plane(AWAY, 0.0, 0.2)], elsewhere, SIGMA)
+    assert around.touches_wall(upright(0.0, -0.5 * RADIUS)) is touches
+
+
 @pytest.mark.parametrize(
     ("gap", "crossing", "touches"), [(0.15, 0.005, True), (0.25, 0.005, False), (0.15, 0.02, False)]
 )
