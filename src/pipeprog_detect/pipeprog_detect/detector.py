@@ -31,7 +31,15 @@ from pipeprog_detect.types import Cloud, Cylinder, Pipe, View
 from pipeprog_detect.verification.end_states import ends_in_cloud, ends_in_views
 from pipeprog_detect.verification.grown_ends import with_grown_ends
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, is_stub, joined, own_contours
+from pipeprog_detect.verification.measured_pipe import (
+    MeasuredPipe,
+    is_probable,
+    is_shown,
+    is_stub,
+    joined,
+    lacks_a_side,
+    own_contours,
+)
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.open_ends import with_open_ends
 from pipeprog_detect.verification.parallel_to_wall import parallel_to_wall
@@ -173,6 +181,9 @@ def detect_outside(
     def is_supported(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
         return any(is_probable(each.cylinder, shown, others) for shown in (judging, coloured) if shown)
 
+    def is_visible(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
+        return any(is_shown(each.cylinder, shown, others) for shown in (judging, coloured) if shown)
+
     def has_two_edges(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
         return not all(is_one_step(Scene.of(each.cylinder, shown, others)) for shown in (judging, coloured) if shown)
 
@@ -190,7 +201,8 @@ def detect_outside(
     # Ends on either side of what hides a pipe may be expected beyond each other: then both pieces are of one pipe.
     whole = with_open_ends(joined(measured, judging, context=around), around, judging)
     whole = joined(whole, judging, overlapping=True, context=around)
-    whole = _judged(whole, judging, has_two_edges)
+    # One that another hides wherever it was seen is that one at another depth, found when only a piece of it was known.
+    whole = _judged(whole, judging, lambda each, others: is_visible(each, others) and has_two_edges(each, others))
     ended = _abutted(with_grown_ends(whole, judging), around, judging, coloured)
     standing = [each for each in ended if not is_hanger(each, prepared.points, around.planes)]
     return [each for each in standing if each.cylinder.length >= config.length_min]
@@ -249,6 +261,8 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
     """Those that stand before the walls and whose outlines are no others', as far as there are views to tell.
 
     A pipe of which others hide both sides has no outlines of its own; it stands where the cloud tells the same of it.
+    One of which the cloud does not resolve the section has those of a pipe on both sides, wherever nothing hides them:
+    two thin pipes side by side look like a thicker one in the cloud.
     """
     if not views:
         return list(measured)
@@ -259,7 +273,16 @@ def _genuine(measured: Sequence[MeasuredPipe], around: SceneContext, views: Sequ
 
     clear = [each for each in measured if is_clear(each)]
     own = own_contours([each.cylinder for each in clear], views)
-    return [each for each, is_own in zip(clear, own, strict=True) if is_own or each.is_as_in_cloud]
+    kept = [each for each, is_own in zip(clear, own, strict=True) if is_own or each.is_as_in_cloud]
+    cylinders = [each.cylinder for each in kept]
+    return [
+        each
+        for number, each in enumerate(kept)
+        if not (
+            each.candidate.radius_held
+            and lacks_a_side(each.cylinder, views, cylinders[:number] + cylinders[number + 1 :])
+        )
+    ]
 
 
 def _judged(

@@ -194,6 +194,18 @@ def test_a_thin_line_without_edges_of_its_own_is_dropped(pipe_views: list[View],
     assert judged(measured, []) == measured
 
 
+@pytest.mark.parametrize(("is_held", "stands"), [(True, False), (False, True)])
+def test_what_the_cloud_does_not_resolve_needs_edges_on_both_sides(
+    pipe_views: list[View], is_held: bool, stands: bool
+) -> None:
+    """Twice as wide as the pipe, whose one edge it has: such as two thin pipes side by side, taken for one."""
+    wider = replace(PIPE.shifted(np.array([-0.02, 0.0, 0.0])), radius=PIPE.radius + 0.02)
+    candidate = Candidate(wider, 1e-3, 100, CloudEvidence(np.pi, 0.9, 0.0, 0.003, 0.0, 3.0), radius_held=is_held)
+    nowhere = octree.build(np.array([[9.0, 9.0, 9.0]]))
+    around = SceneContext(nowhere, None, [], nowhere, 5e-4)
+    assert len(detector._genuine([MeasuredPipe.of_cloud(candidate)], around, pipe_views)) == stands
+
+
 @pytest.mark.parametrize(("scale", "found"), [(0.5, 1), (1.0, 0)])
 def test_a_thick_pipe_that_stereo_misses_is_found_by_its_lines_where_it_is_narrow(scale: float, found: int) -> None:
     """14 px wide in the smaller images, 28 px in the others, where windows of stereo lie within it."""

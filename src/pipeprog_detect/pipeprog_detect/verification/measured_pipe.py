@@ -194,3 +194,13 @@ def is_probable(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cyli
     """Whether edges that are none of the `others`' support both sides, decisively more often than texture would."""
     support = Scene.of(cylinder, views, others).own_support()
     return float(support.log_odds().sum()) > DECISIVE and support.weaker_share >= MIN_SUPPORT
+
+
+def is_shown(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
+    """Whether edges support what the `others` leave visible of it, decisively more often than texture would."""
+    return float(Scene.of(cylinder, views, others).support().log_odds().sum()) > DECISIVE
+
+
+def lacks_a_side(cylinder: Cylinder, views: Sequence[View], others: Sequence[Cylinder]) -> bool:
+    """Whether one side, as far as the `others` leave it visible, decisively shows no edges."""
+    return float(Scene.of(cylinder, views, others).support().log_odds().sum(axis=0).min()) < -DECISIVE

@@ -6,13 +6,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pipeprog_detect.cloud.candidate import Candidate, CloudEvidence
 from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.types import Cylinder, View
-from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, joined
+from pipeprog_detect.verification.measured_pipe import MeasuredPipe, is_probable, is_shown, joined, lacks_a_side
 from tests.unit.detect.pipe_and_wall import PIPE
 from tests.unit.detect.silhouette.test_free_space import HALF, seen, tube
 
@@ -128,3 +129,25 @@ def test_edges_make_a_pipe_probable_unless_they_are_anothers(pipe_views: list[Vi
     assert is_probable(PIPE, pipe_views, [])
     assert not is_probable(PIPE, empty_views, [])
     assert not is_probable(PIPE, pipe_views, [PIPE])
+
+
+def test_a_pipe_that_others_hide_wherever_it_was_seen_is_not_shown(
+    pipe_views: list[View], empty_views: list[View]
+) -> None:
+    before = replace(PIPE.shifted(np.array([0.0, -0.15, 0.0])), radius=0.2)
+    assert is_shown(PIPE, pipe_views, [])
+    assert not is_shown(PIPE, pipe_views, [before])
+    assert not is_shown(PIPE, empty_views, [])
+
+
+@pytest.mark.parametrize(
+    ("aside", "is_hidden", "lacks"), [(0.0, False, False), (0.02, False, True), (0.02, True, False)]
+)
+def test_a_side_without_edges_is_lacking_unless_it_is_hidden(
+    pipe_views: list[View], aside: float, is_hidden: bool, lacks: bool
+) -> None:
+    """A cylinder that is wider than the pipe to one side, by twice `aside` [m], has the pipe's edge on the other."""
+    wider = replace(PIPE.shifted(np.array([-aside, 0.0, 0.0])), radius=PIPE.radius + aside)
+    start, end = wider.at(np.array([-0.5, 1.5])) - [wider.radius, 0.1, 0.0]
+    beside = Cylinder(start, end, 0.03)
+    assert lacks_a_side(wider, pipe_views, [beside] if is_hidden else []) == lacks
