@@ -18,7 +18,7 @@ from pipeprog_detect.silhouette.free_space import free_stretches, is_empty_besid
 from pipeprog_detect.silhouette.scene import Scene
 from pipeprog_detect.types import Cylinder, View
 from pipeprog_detect.verification.candidate_fit import CONVINCING, CandidateFitter
-from pipeprog_detect.verification.measured_pipe import DECISIVE, MeasuredPipe, is_stub
+from pipeprog_detect.verification.measured_pipe import DECISIVE, MeasuredPipe, is_stub, lacks_a_side
 from pipeprog_detect.verification.measurement_cache import MeasurementCache
 from pipeprog_detect.verification.radius_agreement import agree, contradict, doubts, is_resolved
 
@@ -154,7 +154,11 @@ class KeyframeVerifier:
         return kept
 
     def _pieces(self, measured: MeasuredPipe, others: Sequence[Cylinder], trusted: bool) -> list[MeasuredPipe]:
-        """The pipe itself, or what lies between the stretches at which the views see through it, measured anew."""
+        """The pipe itself, or what lies between the stretches at which the views see through it, measured anew.
+
+        A part is no pipe where its contour, which was seen elsewhere, is not found, and one side shows no edges: what
+        the cloud has of the whole says little of a part.
+        """
         whole = measured.cylinder
         free = free_stretches(whole, self._views, others)
         if not free:
@@ -162,7 +166,12 @@ class KeyframeVerifier:
         bounds = [0.0, *(end for stretch in free for end in stretch), whole.length]
         parts = [measured.part(*each) for each in zip(bounds[::2], bounds[1::2], strict=True)]
         pieces = (self.measured(part, others, trusted) for part in parts if _is_long(part.cylinder))
-        return [piece for piece in pieces if piece is not None]
+        return [
+            piece
+            for piece in pieces
+            if piece is not None
+            and (piece.fit or not measured.fit or not lacks_a_side(piece.cylinder, self._views, others))
+        ]
 
     def measured(self, candidate: Candidate, others: Sequence[Cylinder], trusted: bool) -> MeasuredPipe | None:
         """The pipe that cloud and keyframes make of a candidate; None where they make none.

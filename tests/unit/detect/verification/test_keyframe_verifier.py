@@ -15,6 +15,7 @@ from pipeprog_detect.product.boq import BillOfQuantities, PipeClass
 from pipeprog_detect.refinement.contour_fit import ContourFit
 from pipeprog_detect.silhouette.occlusion import with_depths
 from pipeprog_detect.types import Cloud, Cylinder, View
+from pipeprog_detect.verification import keyframe_verifier
 from pipeprog_detect.verification.candidate_fit import CandidateFitter
 from pipeprog_detect.verification.keyframe_verifier import KeyframeVerifier
 from pipeprog_detect.verification.measured_pipe import MeasuredPipe
@@ -179,6 +180,20 @@ def test_a_pipe_of_which_the_cloud_shows_a_piece_is_measured_whole(
     assert len(found) == 1
     assert found[0].cylinder.length == pytest.approx(PIPE.length, abs=4e-3)
     assert found[0].cylinder.radius == pytest.approx(PIPE.radius, abs=5e-4)
+
+
+@pytest.mark.parametrize(("is_seen", "aside", "parts"), [(True, 0.15, 0), (False, 0.15, 1), (True, 0.0, 1)])
+def test_a_part_without_a_contour_is_none_where_that_of_the_whole_is_seen(
+    pipe_views: list[View], monkeypatch: pytest.MonkeyPatch, is_seen: bool, aside: float, parts: int
+) -> None:
+    """`aside` [m]: of the part from where the keyframes show a pipe; beside that they show the wall."""
+    place = PIPE.shifted(np.array([aside, 0.0, 0.0]))
+    fit = ContourFit(place, np.eye(3)[1:], np.eye(5), 2e-4, 0.6, 75.0, 20, (0.0, 0.0), 0.0, 0.5)
+    candidate = Candidate(place, 2e-4, 900, CloudEvidence(np.pi, 0.9, 0.0, 5e-4, 0.0, 3.0))
+    monkeypatch.setattr(keyframe_verifier, "free_stretches", lambda *_: [(0.3, PIPE.length)])
+    monkeypatch.setattr(KeyframeVerifier, "measured", lambda _, part, *__: MeasuredPipe.of_cloud(part))
+    whole = MeasuredPipe(candidate, place, 2e-4, fit=fit if is_seen else None)
+    assert len(KeyframeVerifier(pipe_views, BOQ)._pieces(whole, [], True)) == parts
 
 
 @pytest.mark.parametrize(
