@@ -83,8 +83,8 @@ def joined(
     """The pipes with collinear pieces joined; the radius is that of the piece with the least standard deviation.
 
     Pieces of two radii, or of two axes by their contours, are two pipes, and so are those between which the views see
-    what is behind them, or a wall of the `context` closes around the axis. Only those that lie within each other are
-    joined where `overlapping` is asked for.
+    what is behind them, or a wall of the `context` closes around the axis. Only those that lie within each other, or
+    whose gap is shorter than what the views can see through, are joined where `overlapping` is asked for.
     """
     whole = []
     for pieces in _without_gaps(join([each.cylinder for each in measured]), measured, views, overlapping, context):
@@ -161,9 +161,9 @@ def _is_on_one_axis(one: MeasuredPipe, other: MeasuredPipe, gap: Cylinder) -> bo
 
 
 def _overlap(one: MeasuredPipe, other: MeasuredPipe) -> bool:
-    """Whether two collinear pieces lie within each other along the first one's axis."""
+    """Whether two collinear pieces lie within each other along the first one's axis, or nearly so."""
     ends = one.cylinder.along(np.stack([other.cylinder.start, other.cylinder.end]))
-    return bool(ends.min() < one.cylinder.length and ends.max() > 0.0)
+    return bool(ends.min() < one.cylinder.length + SHORTEST and ends.max() > -SHORTEST)
 
 
 def is_stub(cylinder: Cylinder) -> bool:
