@@ -178,14 +178,25 @@ def detect_outside(
     def is_genuine(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
         return not is_false_line(each.cylinder, each.fit, points, around.planes, judging, others)
 
+    def is_told(
+        each: MeasuredPipe,
+        others: Sequence[Cylinder],
+        tells: Callable[[Cylinder, Sequence[View], Sequence[Cylinder]], bool],
+    ) -> bool:
+        """Whether grey or colour tells something of a pipe."""
+        return any(tells(each.cylinder, shown, others) for shown in (judging, coloured) if shown)
+
     def is_supported(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
-        return any(is_probable(each.cylinder, shown, others) for shown in (judging, coloured) if shown)
+        return is_told(each, others, is_probable)
 
-    def is_visible(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
-        return any(is_shown(each.cylinder, shown, others) for shown in (judging, coloured) if shown)
+    def stays(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
+        """Whether edges support it and are two.
 
-    def has_two_edges(each: MeasuredPipe, others: Sequence[Cylinder]) -> bool:
-        return not all(is_one_step(Scene.of(each.cylinder, shown, others)) for shown in (judging, coloured) if shown)
+        What another pipe hides wherever it was seen is that pipe at another depth, found when a piece of it was known.
+        """
+        return is_told(each, others, is_shown) and is_told(
+            each, others, lambda *scene: not is_one_step(Scene.of(*scene))
+        )
 
     measured = _judged(_genuine(measured, around, judging), judging, is_genuine)
     # What is dropped in the end hides no whole pipe now, nor does a stub of one.
@@ -201,8 +212,7 @@ def detect_outside(
     # Ends on either side of what hides a pipe may be expected beyond each other: then both pieces are of one pipe.
     whole = with_open_ends(joined(measured, judging, context=around), around, judging)
     whole = joined(whole, judging, overlapping=True, context=around)
-    # One that another hides wherever it was seen is that one at another depth, found when only a piece of it was known.
-    whole = _judged(whole, judging, lambda each, others: is_visible(each, others) and has_two_edges(each, others))
+    whole = _judged(whole, judging, stays)
     ended = _abutted(with_grown_ends(whole, judging), around, judging, coloured)
     standing = [each for each in ended if not is_hanger(each, prepared.points, around.planes)]
     return [each for each in standing if each.cylinder.length >= config.length_min]
